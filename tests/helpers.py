@@ -8,6 +8,7 @@ from PIL import Image
 from torch import Tensor
 
 from augment.classifier import Classifier
+from augment.scene.scene import Scene
 
 FRUIT = ["apple", "orange", "pear"]
 
@@ -18,6 +19,15 @@ def bright_or_dark(images: Tensor) -> Tensor:
     return torch.stack([3 * mean, 0.4 + 0 * mean], dim=1)
 
 
+CHANNELS = ("orange", "lime", "sky")
+
+
+def by_channel(size: int, classes: tuple[str, ...] = CHANNELS, name: str = "") -> Classifier:
+    """Make a classifier whose logits are the mean red, green and blue, in the order of classes."""
+    channels = [CHANNELS.index(label) for label in classes]
+    return Classifier(lambda images: 30 * images.mean((2, 3))[:, channels], size, classes, name)
+
+
 def darker_than(limit: float, size: int = 8, name: str = "", scale: float = 100) -> Classifier:
     """Make a classifier that takes images darker than a limit on average for an orange."""
 
@@ -26,6 +36,12 @@ def darker_than(limit: float, size: int = 8, name: str = "", scale: float = 100)
         return torch.stack([-excess, excess], dim=1)
 
     return Classifier(logits, size, ("orange", "other"), name or f"darker than {limit}")
+
+
+def images_of(scene: Scene) -> Tensor:
+    """Render the first view of each example of a scene, (E, 3, H, W)."""
+    rows = torch.arange(len(scene))
+    return scene.render(scene.conditions(rows), rows)[:, 0]
 
 
 def colored_noise(labels: np.ndarray, rng: np.random.Generator, contrast: int) -> np.ndarray:

@@ -29,16 +29,22 @@ def images() -> torch.Tensor:
     return torch.randint(120, 200, (8, 3, 16, 16), generator=draws, dtype=torch.uint8)
 
 
+LABELS = torch.zeros(8, dtype=torch.int64)
+
+
+def seeded(transform, *given):
+    torch.manual_seed(0)
+    return transform(*given)
+
+
 SMOOTH = ["projected_slide", "cast_shadow", "directional", "point", "lamps", "linear", "fractal"]
 
 
 @pytest.mark.parametrize("light", [*SMOOTH, "low_light"])
 def test_steps_lower_the_evidence_of_the_class_in_most_images(images, light):
-    model, labels = Mean(), torch.zeros(8, dtype=torch.int64)
-    torch.manual_seed(0)
-    start = nb.RandomLighting(light)(images)
-    torch.manual_seed(0)
-    found = nb.AdversarialLighting(model, steps=2, lights=light)(images, labels)
+    model = Mean()
+    start = seeded(nb.RandomLighting(light), images)
+    found = seeded(nb.AdversarialLighting(model, steps=2, lights=light), images, LABELS)
     before, after = (model(shown / 255)[:, 0] for shown in (start, found))
     assert found.dtype == torch.uint8 and found.shape == images.shape
     assert ((after < before).sum() >= 5) and (after <= before + 0.05).all()
@@ -46,12 +52,11 @@ def test_steps_lower_the_evidence_of_the_class_in_most_images(images, light):
 
 @pytest.mark.parametrize("dtype", [torch.half, torch.bfloat16, torch.double])
 def test_a_network_of_another_precision_gets_images_of_its_own(images, dtype):
-    floats, labels = (images / 255).to(dtype), torch.zeros(8, dtype=torch.int64)
-    found = []
-    for model in (Mean().to(dtype), Mean()):
-        torch.manual_seed(0)
-        given = floats if model.scale.dtype == dtype else floats.float()
-        found.append(nb.AdversarialLighting(model, steps=1, lights="linear")(given, labels))
+    floats = (images / 255).to(dtype)
+    found = [
+        seeded(nb.AdversarialLighting(model, steps=1, lights="linear"), given, LABELS)
+        for model, given in ((Mean().to(dtype), floats), (Mean(), floats.float()))
+    ]
     assert found[0].dtype == dtype
     # Costs of half precision may differ in the sign of a small gradient.
     assert (found[0] - found[1]).abs().mean() < (0.02 if dtype != torch.double else 1e-6)
@@ -64,7 +69,7 @@ def test_networks_with_one_logit_or_without_a_gradient_are_refused(images):
         def forward(self, images):
             return super().forward(images.detach())
 
-    for labels in (None, torch.zeros(8, dtype=torch.int64)):
+    for labels in (None, LABELS):
         with pytest.raises(InputError, match="at least two"):
             nb.AdversarialLighting(first)(images, labels)
         with pytest.raises(InputError, match="without a gradient"):
@@ -85,7 +90,7 @@ def test_a_detector_that_finds_nothing_has_nothing_to_hide(images):
 
 def test_each_image_is_seen_as_often_as_stated_and_the_network_stays_as_it_was(images):
     model = Mean().train()
-    for steps, targets, extra in ((1, torch.zeros(8).long(), 0), (2, None, 1)):
+    for steps, targets, extra in ((1, LABELS, 0), (2, None, 1)):
         model.seen = 0
         lighting = nb.AdversarialLighting(model, steps=steps, lights="linear")
         lighting(images, targets)
@@ -100,9 +105,8 @@ def test_gradients_of_the_caller_are_left_alone(images):
     given = (images / 255).requires_grad_()
     model = Mean()
     model.offset = torch.zeros(1, requires_grad=True)
-    shown = nb.AdversarialLighting(model, steps=2, lights="linear")(
-        before(given).sigmoid(), torch.zeros(8).long()
-    )
+    lighting = nb.AdversarialLighting(model, steps=2, lights="linear")
+    shown = lighting(before(given).sigmoid(), LABELS)
     tensors = (before.weight, given, model.offset)
     assert all(tensor.grad is None for tensor in tensors)
     model(shown).sum().backward()
@@ -120,11 +124,8 @@ def hiding(**options):
 
 def test_light_hides_boxes_from_a_detector(images):
     target = {"boxes": torch.tensor([[2.0, 2.0, 12.0, 12.0]]), "labels": torch.tensor([1])}
-    lighting = hiding(steps=2, lights="low_light")
-    torch.manual_seed(0)
-    start = nb.RandomLighting("low_light")(images)
-    torch.manual_seed(0)
-    found = lighting(images, [target] * 8)
+    start = seeded(nb.RandomLighting("low_light"), images)
+    found = seeded(hiding(steps=2, lights="low_light"), images, [target] * 8)
     scores = [[item["scores"] for item in DETECTOR(shown / 255)] for shown in (start, found)]
     assert torch.cat(scores[1]).mean() < torch.cat(scores[0]).mean()
 
@@ -135,9 +136,8 @@ def test_neither_the_mode_of_gradients_nor_the_bits_of_a_pixel_matter(images):
     of_16_bits = (images.int() * 257).to(torch.uint16)
     modes = torch.enable_grad, torch.no_grad, torch.inference_mode
     for mode, given in zip(modes, (images / 255, of_16_bits, of_16_bits), strict=True):
-        torch.manual_seed(0)
         with mode():
-            found.append(lighting(given, torch.zeros(8, dtype=torch.int64)))
+            found.append(seeded(lighting, given, LABELS))
     torch.testing.assert_close(found[1].float() / 65535, found[0], rtol=0, atol=1e-4)
     assert torch.equal(found[1], found[2])
 
@@ -145,11 +145,9 @@ def test_neither_the_mode_of_gradients_nor_the_bits_of_a_pixel_matter(images):
 @pytest.mark.parametrize("given", [list, np.array, lambda labels: torch.tensor(labels).int()])
 def test_labels_may_be_lists_arrays_and_tensors_of_any_integers(images, given):
     labels = [0, 1, 1, 0, 1, 0, 0, 1]
-    found = []
-    for targets in (given(labels), torch.tensor(labels)):
-        torch.manual_seed(0)
-        found.append(nb.AdversarialLighting(Mean(), lights="linear")(images, targets))
-    assert torch.equal(*found)
+    lighting = nb.AdversarialLighting(Mean(), lights="linear")
+    targets = given(labels), torch.tensor(labels)
+    assert torch.equal(*(seeded(lighting, images, each) for each in targets))
 
 
 def test_boxes_may_be_whole_numbers_lists_or_those_of_a_sample(images):
@@ -161,10 +159,8 @@ def test_boxes_may_be_whole_numbers_lists_or_those_of_a_sample(images):
     ]
     found = []
     for boxes in (torch.tensor([box]).float(), torch.tensor([box]), [box], *of_samples):
-        lighting = hiding(steps=1)
         targets = [{"boxes": boxes, "labels": [1]}] * 7 + [{"boxes": [], "labels": []}]
-        torch.manual_seed(0)
-        found.append(lighting(images, targets))
+        found.append(seeded(hiding(steps=1), images, targets))
     assert all(torch.equal(found[0], other) for other in found[1:])
 
 
@@ -188,17 +184,14 @@ class Pixels(nn.Module):
 
 
 def segment(images, targets):
-    torch.manual_seed(0)
-    lighting = nb.AdversarialLighting(
-        Pixels(), nb.Segmentation(), lights="low_light", classes=["background", "lamp"]
-    )
-    return lighting(images, targets)
+    options = {"lights": "low_light", "classes": ["background", "lamp"]}
+    return seeded(nb.AdversarialLighting(Pixels(), nb.Segmentation(), **options), images, targets)
 
 
 @pytest.mark.parametrize("change", [lambda x: x.float(), lambda x: (x / 255 - 0.5) / 0.2])
 def test_floats_of_bytes_and_normalized_images_are_refused(images, change):
     with pytest.raises(InputError, match="images has values from"):
-        nb.AdversarialLighting(Mean())(change(images), torch.zeros(8, dtype=torch.int64))
+        nb.AdversarialLighting(Mean())(change(images), LABELS)
 
 
 @pytest.mark.parametrize("label", [255, -1, -100])
@@ -227,11 +220,8 @@ def one_process():
 def test_the_search_makes_no_passes_of_ddp_which_wait_for_other_processes(images, one_process):
     model = nn.parallel.DistributedDataParallel(Mean())
     model.register_forward_pre_hook(lambda *_: pytest.fail("a pass of DDP"))
-    torch.manual_seed(0)
-    found = nb.AdversarialLighting(model)(images, torch.zeros(8, dtype=torch.int64))
-    torch.manual_seed(0)
-    alone = nb.AdversarialLighting(model.module)(images, torch.zeros(8, dtype=torch.int64))
-    assert torch.equal(found, alone)
+    found = seeded(nb.AdversarialLighting(model), images, LABELS)
+    assert torch.equal(found, seeded(nb.AdversarialLighting(model.module), images, LABELS))
 
 
 class Flat(nn.Sequential):
@@ -241,15 +231,12 @@ class Flat(nn.Sequential):
 
 @pytest.mark.filterwarnings("ignore:.torch.jit.script:FutureWarning")
 def test_scripted_networks_are_searched_like_others(images):
-    model, labels = Flat(), torch.zeros(8, dtype=torch.int64)
-    found = []
-    for network in (model, torch.jit.script(model)):
-        torch.manual_seed(0)
-        found.append(nb.AdversarialLighting(network)(images, labels))
-    assert torch.equal(*found)
+    model = Flat()
+    lightings = map(nb.AdversarialLighting, (model, torch.jit.script(model)))
+    assert torch.equal(*(seeded(lighting, images, LABELS) for lighting in lightings))
 
 
 def test_networks_of_torch_export_are_refused_with_the_remedy(images):
     model = torch.export.export(Flat(), (torch.rand(8, 3, 16, 16),)).module()
     with pytest.raises(InputError, match="load_classifier"):
-        nb.AdversarialLighting(model)(images, torch.zeros(8, dtype=torch.int64))
+        nb.AdversarialLighting(model)(images, LABELS)

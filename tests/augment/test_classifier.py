@@ -161,10 +161,6 @@ def without_eval(network: nn.Sequential) -> nn.Module:
     return network
 
 
-def with_normalize(network: nn.Module) -> nn.Module:
-    return nn.Sequential(Normalize(MEAN, STD), network).eval()
-
-
 def with_pixel_mean(network: nn.Module) -> nn.Module:
     network.register_buffer("pixel_mean", torch.zeros(3))
     return network
@@ -176,7 +172,11 @@ def with_pixel_mean(network: nn.Module) -> nn.Module:
         (without_eval, {}, "training mode"),
         (lambda network: network.to("meta"), {"device": "cpu"}, "load its weights"),
         (lambda _: lambda images: {"scores": images.mean((2, 3))}, {}, "dict"),
-        (with_normalize, {"normalization": "imagenet"}, "Normalize"),
+        (
+            lambda network: nn.Sequential(Normalize(MEAN, STD), network).eval(),
+            {"normalization": "imagenet"},
+            "Normalize",
+        ),
         (with_pixel_mean, {"normalization": "imagenet"}, "pixel_mean"),
         (lambda network: network, {"classes": CLASSES[:2]}, "classes has 2 names"),
         (lambda network: network, {"normalization": BYTES}, "value_range"),
@@ -299,41 +299,42 @@ def test_position_embeddings_tell_the_size(said, tmp_path):
     assert "64 × 64 pixels, stated by the file; normalized by mean (0.5, 0.5, 0.5) and std" in line
 
 
-def test_onnx_gives_the_scores_of_its_graph_and_a_size_that_it_tells_is_not_assumed(said, tmp_path):
-    """The graph takes the mean of each channel, which is written without a library of networks."""
-    pytest.importorskip("onnxruntime")
-    onnx = pytest.importorskip("onnx")
-    helper, kind = onnx.helper, onnx.TensorProto.FLOAT
-    for size, path in ((64, tmp_path / "fixed.onnx"), ("size", tmp_path / "free.onnx")):
-        node = helper.make_node("ReduceMean", ["x"], ["y"], axes=[2, 3], keepdims=0)
-        sizes = {"x": ["n", 3, size, size], "y": ["n", 3]}
-        x, y = (helper.make_tensor_value_info(name, kind, sizes[name]) for name in sizes)
-        graph = helper.make_graph([node], "graph", [x], [y])
-        opsets = [helper.make_opsetid("", 13)]
-        onnx.save(helper.make_model(graph, opset_imports=opsets, ir_version=8), path)
-        classifier = nb.load_classifier(str(path))
-        images = torch.rand(4, 3, classifier.size, classifier.size)
-        torch.testing.assert_close(classifier(images), images.mean((2, 3)), rtol=1e-5, atol=1e-6)
-    fixed, free = said()
-    assert "64 × 64 pixels, stated by the file; not normalized, assumed" in fixed
-    assert "224 × 224 pixels, assumed; not normalized, assumed" in free
+def save_onnx(
+    path: Path,
+    kind="FLOAT",
+    inputs=("x",),
+    outputs="y",
+    shape=(SIZE, SIZE),
+    axes=(2, 3),
+    softmax=False,
+) -> str:
+    """Write a graph of the means of x, which is of a kind such as FLOAT16, over its axes."""
+    import onnx
 
-
-def save_onnx(path: Path, kind: str, inputs: tuple[str, ...] = ("x",), outputs: str = "y") -> str:
-    """Write a graph of the means of the channels of x, which is of a kind such as FLOAT16."""
-    pytest.importorskip("onnxruntime")
-    onnx = pytest.importorskip("onnx")
     helper, kinds = onnx.helper, onnx.TensorProto
     nodes = [helper.make_node("Cast", ["x"], ["images"], to=kinds.FLOAT)]
-    options = {"axes": [2, 3], "keepdims": 0}
-    nodes += [helper.make_node("ReduceMean", ["images"], [name], **options) for name in outputs]
-    shape = ["n", 3, SIZE, SIZE]
-    given = [helper.make_tensor_value_info(name, getattr(kinds, kind), shape) for name in inputs]
+    options = {"axes": axes, "keepdims": 0}
+    means = "m" if softmax else outputs
+    nodes += [helper.make_node("ReduceMean", ["images"], [name], **options) for name in means]
+    nodes += [helper.make_node("Softmax", ["m"], ["y"], axis=1)] if softmax else []
+    sides = ["n", 3, *shape] if axes == (2, 3) else ["n", *shape, 3]
+    given = [helper.make_tensor_value_info(name, getattr(kinds, kind), sides) for name in inputs]
     found = [helper.make_tensor_value_info(name, kinds.FLOAT, ["n", 3]) for name in outputs]
     graph = helper.make_graph(nodes, "graph", given, found)
     opsets = [helper.make_opsetid("", 13)]
     onnx.save(helper.make_model(graph, opset_imports=opsets, ir_version=8), path)
     return str(path)
+
+
+def test_onnx_gives_the_scores_of_its_graph_and_a_size_that_it_tells_is_not_assumed(said, tmp_path):
+    for size in (64, "size"):
+        path = save_onnx(tmp_path / f"{size}.onnx", shape=(size, size))
+        classifier = nb.load_classifier(path)
+        images = torch.rand(4, 3, classifier.size, classifier.size)
+        torch.testing.assert_close(classifier(images), images.mean((2, 3)), rtol=1e-5, atol=1e-6)
+    fixed, free = said()
+    assert "64 × 64 pixels, stated by the file; not normalized, assumed" in fixed
+    assert "224 × 224 pixels, assumed; not normalized, assumed" in free
 
 
 @pytest.mark.parametrize("kind", ["FLOAT16", "DOUBLE"])
@@ -351,29 +352,18 @@ def test_onnx_of_bytes_or_of_two_inputs_is_refused_with_a_remedy(tmp_path, kind,
 def test_onnx_of_two_outputs_is_read_by_the_first_which_is_said(tmp_path, images, caplog):
     """A search, which a file without gradients needs, asks a copy that remembers the outputs."""
     say_once.cache_clear()
-    path = save_onnx(tmp_path / "network.onnx", "FLOAT", outputs="yz")
+    path = save_onnx(tmp_path / "network.onnx", outputs="yz")
     classifier = nb.load_classifier(path)
     assert "2 outputs" in caplog.text
     for asked in (classifier, remembering(classifier)):
         torch.testing.assert_close(asked(images), images.mean((2, 3)), rtol=1e-5, atol=1e-6)
 
 
-@pytest.mark.parametrize("is_last", [False, True])
-def test_onnx_of_channels_last_and_of_probabilities_has_gradients_of_logits(tmp_path, is_last):
-    pytest.importorskip("onnxruntime")
+@pytest.mark.parametrize("axes", [(2, 3), (1, 2)], ids=["channels first", "channels last"])
+def test_onnx_of_channels_last_and_of_probabilities_has_gradients_of_logits(tmp_path, axes):
     pytest.importorskip("onnx2torch")
-    onnx = pytest.importorskip("onnx")
-    helper, kind = onnx.helper, onnx.TensorProto.FLOAT
-    axes = [1, 2] if is_last else [2, 3]
-    nodes = [helper.make_node("ReduceMean", ["x"], ["m"], axes=axes, keepdims=0)]
-    nodes.append(helper.make_node("Softmax", ["m"], ["y"], axis=1))
-    sizes = {"x": ["n", 40, 48, 3] if is_last else ["n", 3, 40, 48], "y": ["n", 3]}
-    x, y = (helper.make_tensor_value_info(name, kind, sizes[name]) for name in sizes)
-    graph = helper.make_graph(nodes, "graph", [x], [y])
-    opsets = [helper.make_opsetid("", 13)]
-    path = tmp_path / "network.onnx"
-    onnx.save(helper.make_model(graph, opset_imports=opsets, ir_version=8), path)
-    classifier = nb.load_classifier(str(path))
+    path = save_onnx(tmp_path / "network.onnx", shape=(40, 48), axes=axes, softmax=True)
+    classifier = nb.load_classifier(path)
     assert classifier.size == (40, 48)
     images = torch.rand(4, 3, 40, 48, requires_grad=True)
     expected = images.mean((2, 3)).log_softmax(1)

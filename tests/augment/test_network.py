@@ -1,5 +1,6 @@
 import copy
 from dataclasses import fields
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -35,29 +36,25 @@ class Limited(nn.Module):
         return torch.stack([brightness, 1 - brightness], dim=1)
 
 
-class Shades:
-    """A scene of ten images of one pixel, each with the value of its example."""
+START = torch.linspace(0.2, 1, 10, dtype=torch.float64)[:, None]
 
-    start = torch.linspace(0.2, 1, 10, dtype=torch.float64)[:, None]
 
-    def __init__(self, group_size: int):
-        self.group_size = group_size
-
-    def render(self, values, examples):
-        return values[:, None, :, None, None].expand(-1, 1, 3, 1, 1)
-
-    def scale_gradient(self, gradient):
-        return 0.05 * gradient.sign()
-
-    def project(self, values, examples):
-        return values.clamp(0, 1)
+def shades(group_size: int) -> SimpleNamespace:
+    """Return a scene of ten images of one pixel, each with the value of its example."""
+    return SimpleNamespace(
+        start=START,
+        group_size=group_size,
+        render=lambda values, examples: values[:, None, :, None, None].expand(-1, 1, 3, 1, 1),
+        scale_gradient=lambda gradient: 0.05 * gradient.sign(),
+        project=lambda values, examples: values.clamp(0, 1),
+    )
 
 
 def attack(model: nn.Module, batch_size: int = 4, group_size: int = 10) -> Minimum:
     criterion = ClassCriterion(torch.zeros(10, 1, dtype=torch.int64))
     settings = AttackSettings(max_steps=6, margin=0.0, quantized=False, batch_size=batch_size)
     objective = Objective(model, criterion, settings)
-    return minimize(Shades(group_size), objective, restarts=[Shades.start.flip(0)])
+    return minimize(shades(group_size), objective, restarts=[START.flip(0)])
 
 
 def require_same(actual: Minimum, expected: Minimum) -> None:

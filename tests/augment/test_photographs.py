@@ -143,12 +143,6 @@ def test_photographs_of_another_size_or_without_detections_are_an_error(photogra
         attack_photographs(find_bright, 0 * photographs, SETTINGS, classes=["a", "b"])
 
 
-def plain_light(count=1):
-    shape = (count, 1, SIZE, SIZE)
-    zero = torch.zeros(count, 1, 1, 1)
-    return ProjectedLight(torch.ones(count, 3, SIZE, SIZE), torch.ones(shape), zero, zero)
-
-
 def test_a_camera_sees_albedo_times_light_at_its_exposure():
     albedo = torch.rand(2, 3, SIZE, SIZE, generator=generator(7))
     light = draw_projected_light(2, SIZE, generator(0))
@@ -171,7 +165,9 @@ def test_gains_between_the_cells_stay_within_the_bound():
     radius = math.log(3)
     draws = torch.Generator().manual_seed(0)
     log_gain = radius * (2 * torch.randint(0, 2, (1, 3, 6, 6), generator=draws) - 1.0)
-    gain = plain_light().light(log_gain)
+    zero = torch.zeros(1, 1, 1, 1)
+    white = torch.ones(1, 3, SIZE, SIZE)
+    gain = ProjectedLight(white, white[:, :1], zero, zero).light(log_gain)
     assert gain.max() <= 3 + 1e-5
     assert gain.min() >= 1 / 3 - 1e-5
     # The bound is reached.

@@ -5,7 +5,6 @@ from torchvision.ops import masks_to_boxes
 import norm_balls as nb
 from augment.attack_settings import StepSettings
 from augment.augmentation_settings import AugmentationSettings, TrainingAttackSettings
-from augment.renders import Renders
 from augment.service import AugmentationService
 from augment.tasks.detection import Detection
 from renderer.camera import OrthographicCamera
@@ -26,12 +25,8 @@ def serve(task=None, classes=CLASSES, camera=None, **options) -> AugmentationSer
     return AugmentationService.from_meshes(MESHES, SIZE, given, task=task, classes=classes, **scene)
 
 
-@pytest.fixture(scope="module")
-def renders() -> Renders:
-    return serve(mode="random").regenerate(BrightBox((0, 0, SIZE, SIZE)), 0)
-
-
-def test_targets_are_the_pixels_that_differ_from_the_background(renders):
+def test_targets_are_the_pixels_that_differ_from_the_background():
+    renders = serve(mode="random").regenerate(BrightBox((0, 0, SIZE, SIZE)), 0)
     is_object = (renders.images != 0.5).any(1)
     for shown, label, target in zip(is_object, renders.labels, renders.targets, strict=True):
         count = int(label >= 0)

@@ -15,6 +15,7 @@ from typing import Any
 
 import mpmath
 import numpy as np
+from numpy import cross
 from numpy.typing import ArrayLike
 
 MP = mpmath.mp.clone()
@@ -31,11 +32,7 @@ def extended(values: ArrayLike) -> np.ndarray:
     return np.asarray(values, dtype=np.longdouble)
 
 
-def exact(values: ArrayLike) -> np.ndarray:
-    return _to_exact(values)
-
-
-_to_exact = np.frompyfunc(MP.mpf, 1, 1)
+exact = np.frompyfunc(MP.mpf, 1, 1)
 _exact_sqrt = np.frompyfunc(MP.sqrt, 1, 1)
 _exact_imaginary_part = np.frompyfunc(lambda number: number.imag, 1, 1)
 
@@ -75,7 +72,7 @@ def view(ids, samples, placed, vertices, faces, albedo, towards, lift) -> View:
     seen, face = np.unique(ids[row, column][order], return_inverse=True)
 
     corners = faces[seen]
-    placed_normals = cross(*_edges(lift(placed), corners))
+    placed_normals = cross(*_edges(lift(placed), corners), axis=0)
     cosines = (placed_normals * lift(towards)[:, None]).sum(axis=0)
     first, second = _edges(lift(vertices), corners)
     side = np.where(cosines < 0, -1, 1)
@@ -111,13 +108,13 @@ def vertex_gradient(view, upstream, light, vertex_count) -> np.ndarray:
     third_corner = np.stack(by_second, axis=1)
     first_corner = -second_corner - third_corner
     by_corner = np.stack([first_corner, second_corner, third_corner], axis=1)
-    squared_area = (cross(view.first, view.second) ** 2).sum(axis=0)
+    squared_area = (cross(view.first, view.second, axis=0) ** 2).sum(axis=0)
     by_corner = by_corner * (squared_area != 0)[:, None, None]
     return added(vertex_count, view.corners.ravel(), by_corner.reshape(-1, 3))
 
 
 def _weighted_irradiance(view, weight, light, first, second) -> np.ndarray:
-    normals = unit(cross(first, second)) * view.side
+    normals = unit(cross(first, second, axis=0)) * view.side
     return (irradiance(normals, light) * weight).sum(axis=1)
 
 
@@ -127,7 +124,7 @@ def _face_weight(view: View, upstream: np.ndarray) -> np.ndarray:
 
 
 def normals_of(view: View) -> np.ndarray:
-    return unit(cross(view.first, view.second)) * view.side
+    return unit(cross(view.first, view.second, axis=0)) * view.side
 
 
 def _edges(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -267,13 +264,6 @@ def derivative(values: np.ndarray) -> np.ndarray:
     if is_exact(values):
         return _exact_imaginary_part(values) / MP.mpf(STEP)
     return values.imag / np.longdouble(STEP)
-
-
-def cross(u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    x = u[1] * v[2] - u[2] * v[1]
-    y = u[2] * v[0] - u[0] * v[2]
-    z = u[0] * v[1] - u[1] * v[0]
-    return np.stack([x, y, z])
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ import torch
 from numpy.polynomial.chebyshev import chebpts1, chebvander2d
 from safetensors.torch import save_file
 from scipy.spatial.transform import Rotation
-from scipy.special import roots_legendre
+from scipy.special import roots_sh_legendre
 
 from renderer.light.harmonics import basis
 from renderer.light.skylight import coefficients
@@ -97,8 +97,9 @@ def coefficients_by_quadrature(zenith, azimuth, turbidity, nodes=48) -> np.ndarr
     """
     # A sun overhead has no arcs, and the ratio of the tangents would be 0/0.
     tilt = max(zenith, 1e-8)
-    u, u_weights = _unit_interval_quadrature(nodes)
-    v, v_weights = _unit_interval_quadrature(2 * nodes)
+    # Nodes and weights of Gauss-Legendre quadrature over [0, 1].
+    u, u_weights = roots_sh_legendre(nodes)
+    v, v_weights = roots_sh_legendre(2 * nodes)
     t = math.pi * u
     horizon_angle = math.pi / 2 - tilt
     arc_angles = math.pi / 2 - tilt * np.cos(t)
@@ -118,12 +119,6 @@ def coefficients_by_quadrature(zenith, azimuth, turbidity, nodes=48) -> np.ndarr
     sky = radiance(directions[:, 2], angles.ravel(), zenith, turbidity)
     harmonics = basis(torch.from_numpy(directions), 6).numpy()
     return harmonics.T @ (solid_angles.reshape(-1, 1) * sky)
-
-
-def _unit_interval_quadrature(nodes: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the nodes and weights of Gauss-Legendre quadrature over [0, 1]."""
-    positions, weights = roots_legendre(nodes)
-    return (1 + positions) / 2, weights / 2
 
 
 def radiance(cosine: np.ndarray, angle: np.ndarray, zenith: float, turbidity: float) -> np.ndarray:

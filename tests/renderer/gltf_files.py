@@ -97,3 +97,10 @@ class Gltf:
 
     def load(self, folder: Path, gloss: bool = False) -> Mesh:
         return load_mesh(self.write(folder / "mesh.gltf"), up="z", gloss=gloss)
+
+
+def read_tree(path: Path) -> dict[str, Any]:
+    """Read the JSON of a .glb file."""
+    content = path.read_bytes()
+    (length,) = struct.unpack_from("<I", content, 12)
+    return json.loads(content[20 : 20 + length])

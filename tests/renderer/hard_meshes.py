@@ -9,6 +9,7 @@ import torch
 import trimesh
 from numpy.typing import ArrayLike
 from torch import Tensor
+from trimesh.util import unitize
 
 from renderer.camera import Points
 from renderer.mesh import Mesh, concatenate
@@ -51,8 +52,8 @@ def slivers(height: float, count: int, towards: np.ndarray) -> Mesh:
     """Create needles and caps in all orders of corners, whose longest edges are about 1."""
     rng = np.random.default_rng(2)
     shape = (2 * count, 3)
-    normal = _unit(rng.normal(size=shape) + 3 * towards)
-    along = _unit(np.cross(normal, rng.normal(size=shape)))
+    normal = unitize(rng.normal(size=shape) + 3 * towards)
+    along = unitize(np.cross(normal, rng.normal(size=shape)))
     across = np.cross(normal, along)
     # Position of the third corner along the edge between the other two.
     foot = np.repeat([1.0, 0.4], count)[:, None]
@@ -106,7 +107,3 @@ def boards() -> Mesh:
     heights = [0.0, 0.05, 0.1, 0.15, 0.2]
     lifted = [board.vertices + np.array([0, 0, height]) for height in heights]
     return concatenate([painted(vertices, board.faces) for vertices in lifted])
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)

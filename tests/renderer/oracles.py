@@ -2,6 +2,7 @@
 
 import io
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -10,16 +11,23 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from numpy.polynomial import legendre
 from numpy.typing import ArrayLike
 from PIL import Image
-from scipy.special import sph_harm_y_all
+from scipy.ndimage import map_coordinates
+from scipy.special import roots_sh_legendre, sph_harm_y_all
 
+from renderer.camera import Camera
 from renderer.io.meshes import load_mesh
+from renderer.light.environment import write_map
 from renderer.light.harmonics import lambertian_factors
 from renderer.mesh import Mesh, normalize
+from renderer.mitsuba_scene import SCENE, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
 from renderer.operators.apply import TransferOperator
+from renderer.operators.build import build_operators
+from renderer.settings import ImageSettings
 from renderer.solids import SOLIDS, solid
+from renderer.visibility import choose
+from renderer.visibility.fragments import Fragments, build_fragments
 
 SCANS = Path(__file__).parents[3] / "shared" / "data" / "meshes"
 
@@ -100,6 +108,44 @@ def named_mesh(name: str) -> Mesh:
     return normalize(load_mesh(SCANS / name))
 
 
+def square(half: float, center: ArrayLike = (0, 0, 0), color: ArrayLike = (1, 1, 1)) -> Mesh:
+    """Return two triangles in a plane of constant z that face upward."""
+    corners = half * np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
+    return Mesh.plain(corners + center, [[0, 1, 2], [0, 2, 3]], color)
+
+
+def fragments_of(mesh: Mesh, camera: Camera, settings: ImageSettings, closed=False) -> Fragments:
+    rasterizer = choose("numpy")
+    [view] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, rasterizer, closed)
+    return view
+
+
+def operator_of(mesh: Mesh, camera: Camera, settings: ImageSettings, **options) -> TransferOperator:
+    [operator] = build_operators(mesh, [camera], settings, choose("numpy"), **options)
+    return operator
+
+
+def path_traced(
+    folder: Path,
+    mesh: Mesh,
+    cameras: Sequence[Camera],
+    light: torch.Tensor,
+    settings: ImageSettings,
+    albedo_scale: float = 1.0,
+    lights=(),
+) -> torch.Tensor:
+    """Render the files of a scene with Mitsuba: radiance and coverage (views, 4, H, W)."""
+    write_map(folder / "light.exr", mitsuba_map(light, 256))
+    scene = folder / "mitsuba"
+    write_mitsuba_scene(scene, mesh, albedo_scale, cameras, settings, "../light.exr", lights)
+    return render_mitsuba_scene(scene / SCENE, len(cameras), settings.shape).double()
+
+
+def relative_error(found: ArrayLike, expected: ArrayLike) -> float:
+    expected = np.asarray(expected)
+    return float(np.linalg.norm(np.asarray(found) - expected) / np.linalg.norm(expected))
+
+
 def corners_of(mesh: Mesh) -> np.ndarray:
     """Return the positions of the corners of all faces, shape (F, 3 corners, 3)."""
     return mesh.vertices[mesh.faces]
@@ -112,6 +158,14 @@ def image_of(operator: TransferOperator, light: torch.Tensor) -> torch.Tensor:
     image[:3, operator.pixels] = operator.radiance(light).double()
     image[3, operator.pixels] = operator.coverage.double()
     return image.unflatten(1, (size, size))
+
+
+def bilinear(texels: np.ndarray, row: np.ndarray, column: np.ndarray) -> np.ndarray:
+    """Interpolate texels (H, W, C), which repeat, at places (N,) in units from center to center."""
+    place = np.stack([row, column])
+    channels = np.moveaxis(texels, 2, 0)
+    values = [map_coordinates(one, place, order=1, mode="grid-wrap") for one in channels]
+    return np.stack(values, axis=1)
 
 
 def srgb_of(linear: ArrayLike) -> np.ndarray:
@@ -198,11 +252,9 @@ def directions_of(z: np.ndarray, azimuth: np.ndarray) -> np.ndarray:
 @cache
 def half_hemisphere() -> tuple[np.ndarray, np.ndarray]:
     """Return directions with y > 0, densest where lobes are narrow, and twice their weights."""
-    node, weight = legendre.leggauss(100)
-    around, step = legendre.leggauss(50)
-    root = (node[:, None] + 1) / 2
-    fraction = (around + 1) / 2
-    solid_angles = weight[:, None] * root * 3 * math.pi * fraction**2 * step
+    root, weight = (values[:, None] for values in roots_sh_legendre(100))
+    fraction, step = roots_sh_legendre(50)
+    solid_angles = 4 * weight * root * 3 * math.pi * fraction**2 * step
     return directions_of(root**2, math.pi * fraction**3), solid_angles.ravel()
 
 

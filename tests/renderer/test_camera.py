@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from oracles import fragments_of
 
 from renderer.camera import (
     OrthographicCamera,
@@ -24,8 +25,6 @@ from renderer.mesh import Mesh
 from renderer.operators.rays import Surface
 from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
-from renderer.visibility import choose
-from renderer.visibility.fragments import build_fragments
 
 EPS = np.finfo(np.float64).eps
 ORTHOGRAPHIC = [OrthographicCamera(0, 0, 2.0), OrthographicCamera(180.0, 57.3, 3.0)]
@@ -163,7 +162,7 @@ def test_a_sample_shows_the_face_that_its_ray_meets_first_its_side_and_the_point
     """A few samples near edges differ, because corners are rounded by up to 1/512 of a sample."""
     mesh = open_torus()
     settings = ImageSettings(64, 1)
-    [view] = build_fragments(mesh.vertices, mesh.faces, [CAMERA], settings, choose("numpy"))
+    view = fragments_of(mesh, CAMERA, settings)
     ids = np.full(64 * 64, -1)
     ids[view.sample_numbers] = view.faces[view.sample_to_seen_face]
     expected, hits = first_hits(mesh, rays(64))
@@ -199,8 +198,7 @@ def test_a_texture_on_a_tilted_plane_follows_the_homography_of_its_corners():
     corners[3] = corners[0] + corners[2] - corners[1]
     uvs = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    settings = ImageSettings(32, 2)
-    [view] = build_fragments(corners, faces, [CAMERA], settings, choose("numpy"))
+    view = fragments_of(Mesh.plain(corners, faces), CAMERA, ImageSettings(32, 2))
 
     homography = homography_of(CAMERA.project(corners)[:, :2], uvs)
     homogeneous = np.column_stack([view.positions(), np.ones(len(view.sample_numbers))])

@@ -178,26 +178,6 @@ def test_moved_vertices_keep_the_sharp_edges_of_the_mesh():
     torch.testing.assert_close(found, nb.render(moved, camera, light, **options))
 
 
-def obj_of(mesh: nb.Mesh, normals: np.ndarray) -> str:
-    lines = [f"v {x} {y} {z}" for x, y, z in mesh.vertices]
-    lines += [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in normals.reshape(-1, 3)]
-    for face, corners in enumerate(mesh.faces + 1):
-        lines.append("f " + " ".join(f"{v}//{3 * face + i + 1}" for i, v in enumerate(corners)))
-    return "\n".join(lines)
-
-
-def test_a_file_keeps_the_rim_of_a_can_apart_and_its_side_together(tmp_path):
-    """The can is coarse: its side bends by 60° at each edge, which the normals make smooth."""
-    can = mesh_of(trimesh.creation.cylinder(0.5, 1.2, sections=6))
-    normals = can.face_normals()[:, None].repeat(3, axis=1)
-    is_side = ~lids(can)
-    normals[is_side] = corners_of(can)[is_side] * [2, 2, 0]
-    (tmp_path / "can.obj").write_text(obj_of(can, normals))
-    assert nb.load_mesh(tmp_path / "can.obj").normal_ids.max() + 1 == 2 * 6 * 2 + 2
-    (tmp_path / "flat.obj").write_text(obj_of(can, 0 * normals))
-    assert nb.load_mesh(tmp_path / "flat.obj").normal_ids.max() + 1 == 6 * 4 + 2 * 7
-
-
 def test_parts_of_a_file_share_the_normals_where_they_meet(tmp_path):
     """The lower half of an ellipsoid is the mirrored upper half, which is turned and stretched."""
     octahedron = trimesh.convex.convex_hull(np.concatenate([np.eye(3), -np.eye(3)]))

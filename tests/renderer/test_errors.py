@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 import torch
+from oracles import square
 
 from renderer import errors
-from renderer.mesh import Mesh
 
-MESH = Mesh.plain([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]])
+MESH = square(1)
 COMPLEX = torch.ones(2, 3) * 1j
 NO_NUMBERS = ("x", None, 1j, {}, MESH, [None], ["a"], [[1], [1, 2]], COMPLEX, COMPLEX.numpy())
 NO_NUMBERS += (np.full(3, None), torch.ones(3) > 0, True)

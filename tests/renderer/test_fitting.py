@@ -2,20 +2,19 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 import torch
-from oracles import draw_uniform, named_mesh
+from oracles import draw_uniform, named_mesh, path_traced, relative_error
 from torch import Tensor
 
 import renderer
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.errors import InputError
-from renderer.fit import FittedScene, fit_scene
-from renderer.light.environment import to_map, write_map
+from renderer.fit import fit_scene
+from renderer.light.environment import to_map
 from renderer.light.files import load_light
-from renderer.mitsuba_scene import SCENE, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
+from renderer.mitsuba_scene import mitsuba_map
 from renderer.settings import ImageSettings
 
 FAR = OrthographicCamera(51.6, 114.6, 3.0, 0.2, -0.1)
@@ -48,30 +47,25 @@ def require_same_camera(found: Camera, expected: Camera) -> None:
 def irradiance_error(found, mesh, camera, light) -> float:
     white = renderer.Mesh.plain(mesh.vertices, mesh.faces)
     operator = renderer.precompute_transfer(white, camera, 64)
-    expected = operator.radiance(light)
-    difference = operator.radiance(found.light) - expected
-    return float(difference.norm() / expected.norm())
+    return relative_error(operator.radiance(found.light), operator.radiance(light))
 
 
-def nearby_fit(brightness: float) -> tuple[FittedScene, float]:
-    """Fit a mushroom in a render, from 3° beside its camera, and return the irradiance's error."""
+@pytest.mark.slow
+@pytest.mark.parametrize(("brightness", "bound"), [(9.0, 0.055), (1.0, 0.05), (13.0, 0.17)])
+def test_camera_and_light_are_found_also_if_parts_are_overexposed(brightness, bound):
+    """A sixth and a third of the object's values are 1, and tell no more than that it is bright.
+
+    The fit starts 3° beside the camera.
+    """
     mesh = renderer.normalize(renderer.solid("mushroom"))
     light = brightness * positive_light("eucalyptus")
     image = renderer.render(mesh, FAR, light, 32, 0.0, samples=8)
     mask = coverage_of(mesh, FAR, 32)
     start = replace(FAR, polar=FAR.polar + 3, azimuth=FAR.azimuth - 3)
     found = fit_scene(image.clamp(0, 1), mask, mesh, start=start)
-    return found, irradiance_error(found, mesh, FAR, light)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("brightness", "bound"), [(9.0, 0.055), (1.0, 0.05), (13.0, 0.17)])
-def test_camera_and_light_are_found_also_if_parts_are_overexposed(brightness, bound):
-    """A sixth and a third of the object's values are 1, and tell no more than that it is bright."""
-    found, error = nearby_fit(brightness)
     assert to_map(found.light, 128).min() >= 0
     require_same_camera(found.camera, FAR)
-    assert error < bound
+    assert irradiance_error(found, mesh, FAR, light) < bound
 
 
 @pytest.mark.slow
@@ -83,13 +77,6 @@ def test_a_renders_camera_and_light_are_found_before_any_background():
     found = fit_scene(image, coverage_of(mesh, FAR, 48), mesh)
     require_same_camera(found.camera, FAR)
     assert irradiance_error(found, mesh, FAR, light) < 0.05
-
-
-def path_traced(folder: Path, mesh: renderer.Mesh, camera: Camera, light: Tensor) -> Tensor:
-    write_map(folder / "light.exr", mitsuba_map(light, 192))
-    write_mitsuba_scene(folder, mesh, 1.0, [camera], ImageSettings(64, bounces=3), "light.exr")
-    [image] = render_mitsuba_scene(folder / SCENE, 1, (64, 64))
-    return image.double().clamp(0, 1)
 
 
 @pytest.mark.filterwarnings("ignore:ignored in .glb")
@@ -105,10 +92,10 @@ def path_traced(folder: Path, mesh: renderer.Mesh, camera: Camera, light: Tensor
     ],
 )
 def test_a_path_traced_images_camera_and_light_are_found(tmp_path, name, camera, light_name, bound):
-    pytest.importorskip("mitsuba")
     mesh = named_mesh(name)
     light = positive_light(light_name)
-    image = path_traced(tmp_path, mesh, camera, light)
+    [traced] = path_traced(tmp_path, mesh, [camera], light, ImageSettings(64, bounces=3))
+    image = traced.clamp(0, 1)
     fov = camera.angle if camera is NEAR else None
     found = fit_scene(image[:3], image[3], mesh, fov=fov, bounces=3)
     require_same_camera(found.camera, camera)

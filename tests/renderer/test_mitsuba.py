@@ -9,19 +9,15 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import image_of, mesh_of, textured
+from oracles import image_of, mesh_of, operator_of, textured
 
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.light.environment import write_map
 from renderer.mesh import Mesh, normalize
 from renderer.mitsuba_scene import SCENE, mitsuba, mitsuba_map, write_mitsuba_scene
 from renderer.operators import rays
-from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings
 from renderer.solids import solid
-from renderer.visibility import choose
-
-pytest.importorskip("mitsuba")
 
 # Number of independent images of Mitsuba, from which its noise is estimated.
 SEED_COUNT = 32
@@ -98,8 +94,7 @@ def vessel() -> Mesh:
 
 
 def our_image(mesh: Mesh, camera: Camera, settings: ImageSettings) -> np.ndarray:
-    [operator] = build_operators(mesh, [camera], settings, choose("numpy"))
-    return image_of(operator, LIGHT).permute(1, 2, 0).numpy()
+    return image_of(operator_of(mesh, camera, settings), LIGHT).permute(1, 2, 0).numpy()
 
 
 class NoisyImage(NamedTuple):

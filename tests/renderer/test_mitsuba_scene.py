@@ -3,26 +3,23 @@
 import faulthandler
 from dataclasses import replace
 
+import drjit
 import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import image_of, mesh_of, textured
+from oracles import image_of, mesh_of, operator_of, path_traced, relative_error, textured
 from torch import Tensor
 
 from renderer.camera import OrthographicCamera, PerspectiveCamera
 from renderer.light.environment import write_map
 from renderer.light.files import load_light
 from renderer.mesh import Mesh, normalize
-from renderer.mitsuba_scene import SCENE, mitsuba_map, render_mitsuba_scene, write_mitsuba_scene
-from renderer.operators.build import build_operators
+from renderer.mitsuba_scene import SCENE, render_mitsuba_scene, write_mitsuba_scene
 from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
 from renderer.surface.gloss import Gloss
-from renderer.visibility import choose
 
-pytest.importorskip("mitsuba")
-drjit = pytest.importorskip("drjit")
 ASIDE = {"roll": 34.0, "center_x": 0.3, "principal_right": 0.3, "principal_up": -0.2}
 CAMERAS = [
     OrthographicCamera(57.3, 126.1, 2.3),
@@ -56,12 +53,9 @@ def test_mitsuba_renders_the_files_as_the_renderer_does(tmp_path, make_mesh, enc
     mesh = normalize(make_mesh())
     light = load_light("st_peters")
     settings = ImageSettings(24, 8, encoding, normals)
-    write_mitsuba_scene(tmp_path / "mitsuba", mesh, 2.0, CAMERAS, settings, "../light.exr")
-    write_map(tmp_path / "light.exr", mitsuba_map(light, 256))
-    references = render_mitsuba_scene(tmp_path / "mitsuba" / SCENE, len(CAMERAS), (24, 24)).double()
-    operators = build_operators(mesh, CAMERAS, settings, choose("numpy"), 2.0)
-    for operator, expected in zip(operators, references, strict=True):
-        found = image_of(operator, light)
+    references = path_traced(tmp_path, mesh, CAMERAS, light, settings, albedo_scale=2.0)
+    for camera, expected in zip(CAMERAS, references, strict=True):
+        found = image_of(operator_of(mesh, camera, settings, albedo_scale=2.0), light)
         error = found - expected
         is_inside = (found[3] == 1) & (expected[3] == 1)
         assert is_inside.sum() > 100
@@ -91,11 +85,8 @@ def test_mitsuba_scales_the_albedo_at_each_bounce(tmp_path, make_mesh):
     mesh = normalize(make_mesh())
     light = load_light("st_peters") / 3
     settings = ImageSettings(24, 2, "srgb", bounces=3)
-    write_mitsuba_scene(tmp_path / "mitsuba", mesh, 3.0, CAMERAS[:1], settings, "../light.exr")
-    write_map(tmp_path / "light.exr", mitsuba_map(light, 256))
-    [expected] = render_mitsuba_scene(tmp_path / "mitsuba" / SCENE, 1, (24, 24)).double()
-    [operator] = build_operators(mesh, CAMERAS[:1], settings, choose("numpy"), 3.0)
-    found = image_of(operator, light)
+    [expected] = path_traced(tmp_path, mesh, CAMERAS[:1], light, settings, albedo_scale=3.0)
+    found = image_of(operator_of(mesh, CAMERAS[0], settings, albedo_scale=3.0), light)
     is_inside = (found[3] == 1) & (expected[3] == 1)
     assert is_inside.sum() > 100
     found_mean, expected_mean = (image[:3, is_inside].mean() for image in (found, expected))
@@ -110,21 +101,15 @@ def test_gloss_survives_in_a_mitsuba_scene(tmp_path):
     gloss_texture = np.random.default_rng(0).integers(100, 255, (9, 6, 2), dtype=np.uint8)
     metal = replace(Gloss(0.6, metallic=1.0).on(with_texture), gloss_textures=(gloss_texture,))
     varnished = Gloss(0.4).on(with_texture)
-    write_map(tmp_path / "light.exr", mitsuba_map(light, 256))
 
     def render(mesh: Mesh) -> Tensor:
-        [operator] = build_operators(mesh, CAMERAS[:1], settings, choose("numpy"))
-        return image_of(operator, light)[:3]
+        return image_of(operator_of(mesh, CAMERAS[0], settings), light)[:3]
 
-    matte_image = render(with_texture)
-    for name, mesh, largest_error in (("metal", metal, 0.05), ("varnish", varnished, 0.1)):
-        write_mitsuba_scene(tmp_path / name, mesh, 1.0, CAMERAS[:1], settings, "../light.exr")
-        [rendered] = render_mitsuba_scene(tmp_path / name / SCENE, 1, (24, 24)).double()
-        expected = rendered[:3]
-        error = (render(mesh) - expected).norm() / expected.norm()
-        matte_error = (matte_image - expected).norm() / expected.norm()
+    for mesh, largest_error in ((metal, 0.05), (varnished, 0.1)):
+        expected = path_traced(tmp_path, mesh, CAMERAS[:1], light, settings)[0, :3]
+        error = relative_error(render(mesh), expected)
         assert error < largest_error
-        assert error < 0.8 * matte_error
+        assert error < 0.8 * relative_error(render(with_texture), expected)
 
 
 def test_a_scene_is_rendered_on_a_single_core_too(tmp_path):

@@ -40,28 +40,23 @@ def test_derivatives_on_a_mesh_are_central_differences(function, shape):
     assert torch.autograd.gradcheck(normals, vertices, fast_mode=True)
 
 
-def exact_cross_product(u: list[Fraction], v: list[Fraction]) -> list[Fraction]:
-    return [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
-
-
 def exact_normal(corners: torch.Tensor) -> tuple[np.ndarray, np.ndarray]:
     """Compute the normal of a triangle and its derivative (3, 3 corners, 3) in exact arithmetic.
 
     If a corner moves by dv, the cross product of the edges moves by e × dv, with the opposite edge
     e. The normal moves by the tangential part of it, divided by the length of the cross product.
     """
-    a, b, c = ([Fraction(value) for value in corner] for corner in corners.double().tolist())
-    pairs = ((b, c), (c, a), (a, b))
-    opposite_edges = [[end - start for start, end in zip(*pair, strict=True)] for pair in pairs]
-    cross = exact_cross_product(opposite_edges[2], [-value for value in opposite_edges[1]])
+    a, b, c = np.frompyfunc(Fraction, 1, 1)(corners.double().numpy())
+    opposite_edges = np.stack([c - b, a - c, b - a])
+    cross = np.cross(opposite_edges[2], -opposite_edges[1])
     # Division by the largest component keeps tiny areas in the range of float64.
-    largest = max(map(abs, cross))
+    largest = max(abs(cross))
     if not largest:
         return np.zeros(3), np.zeros((3, 3, 3))
-    direction = np.array([float(value / largest) for value in cross])
+    direction = (cross / largest).astype(np.float64)
     length = np.linalg.norm(direction)
     normal = direction / length
-    edges = np.array(opposite_edges, dtype=np.float64)
+    edges = opposite_edges.astype(np.float64)
     by_corner = np.stack([np.cross(edge, np.eye(3)).T for edge in edges], axis=1)
     tangential = np.eye(3) - np.outer(normal, normal)
     slopes = np.einsum("ad,dcb->acb", tangential, by_corner) / (length * float(largest))

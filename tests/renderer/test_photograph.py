@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from oracles import relative_error
 
 import renderer
 from renderer.camera import OrthographicCamera, PerspectiveCamera
@@ -13,10 +14,6 @@ from renderer.photograph import Photograph
 
 SIZE = 384  # pixels per side of the photographs
 GRACE = renderer.load_light("grace").double()
-
-
-def error(actual: torch.Tensor, expected: torch.Tensor) -> float:
-    return float((actual.double() - expected).norm() / expected.norm())
 
 
 def photographed(mesh: renderer.Mesh, camera: renderer.camera.Camera) -> np.ndarray:
@@ -41,8 +38,8 @@ def test_a_window_of_a_wide_photograph_is_what_the_turned_camera_renders(size, s
     turned = PerspectiveCamera(*map(math.degrees, angles), width, distance=distance)
     expected = renderer.render(mesh, turned, GRACE, size, 0.0, samples=8)
     straight = Photograph(pixels, None).window(origin, side, above).cut(pixels, size)
-    assert error(window.cut(pixels, size), expected) < 0.04
-    assert error(straight, expected) > 0.1
+    assert relative_error(window.cut(pixels, size), expected) < 0.04
+    assert relative_error(straight, expected) > 0.1
 
 
 def test_a_photograph_without_its_upper_and_lower_edge_has_the_same_window():
@@ -68,7 +65,7 @@ def test_a_window_without_perspective_is_what_the_moved_camera_renders():
     window = Photograph(pixels, None).window(origin, SIZE / 2, np.array([0.0, 1.0, 0.0]))
     nearer = OrthographicCamera(57.3, 40.1, 3.0)
     expected = renderer.render(mesh, nearer, GRACE, 48, 0.0, samples=8)
-    assert error(window.cut(pixels, 48), expected) < 0.02
+    assert relative_error(window.cut(pixels, 48), expected) < 0.02
 
 
 def test_a_window_beyond_the_photograph_repeats_the_border_or_has_the_given_value():

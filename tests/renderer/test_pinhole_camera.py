@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from oracles import fragments_of
 from scipy.spatial.transform import Rotation
 
 import renderer
@@ -12,8 +13,6 @@ from renderer.errors import InputError
 from renderer.operators.rays import Surface
 from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings
-from renderer.visibility import choose
-from renderer.visibility.fragments import build_fragments
 from tests.renderer.test_camera import open_torus
 
 SIZE = 64
@@ -100,7 +99,7 @@ def test_a_sample_shows_the_point_of_its_own_pixel():
     torus = open_torus()
     mesh = replace(torus, vertices=torus.vertices + PLACE)
     settings = ImageSettings(SIZE, 1)
-    [seen] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, choose("numpy"))
+    seen = fragments_of(mesh, camera, settings)
     assert len(seen.sample_numbers) > 300
     points = Surface(mesh, seen, settings).points.numpy()
     row, column = np.divmod(seen.sample_numbers.numpy(), SIZE)

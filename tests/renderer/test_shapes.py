@@ -1,13 +1,9 @@
 """Procedural solids: closed shells of faces that point outward."""
 
-from collections import Counter
-
 import numpy as np
 import pytest
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+import trimesh
 
-from renderer.mesh import Mesh
 from renderer.solids import HARD_NEGATIVES, SOLIDS, solid
 
 ALL = SOLIDS | HARD_NEGATIVES
@@ -17,30 +13,18 @@ SHELL_COUNTS = dict.fromkeys(ALL, 1) | {"cup": 2}
 SPHERE = 2
 
 
-def shells(mesh: Mesh) -> list[np.ndarray]:
-    a, b, c = mesh.faces.T
-    rows = np.concatenate([a, b])
-    columns = np.concatenate([b, c])
-    vertex_count = len(mesh.vertices)
-    links = coo_array((np.ones(len(rows)), (rows, columns)), shape=(vertex_count, vertex_count))
-    count, shell_of_vertex = connected_components(links, directed=False)
-    return [mesh.faces[shell_of_vertex[a] == shell] for shell in range(count)]
-
-
 @pytest.mark.parametrize("name", ALL)
 def test_a_solid_has_closed_shells_with_faces_outward_and_fills_the_unit_box(name):
     mesh = solid(name, 1)
+    shape = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
     # Each directed edge occurs once, and its reverse, too.
-    edges = Counter((face[i], face[(i + 1) % 3]) for face in mesh.faces.tolist() for i in range(3))
-    assert set(edges.values()) == {1}
-    assert all((end, start) in edges for start, end in edges)
-    parts = shells(mesh)
-    assert len(parts) == SHELL_COUNTS[name]
-    for faces in parts:
-        edge_count = 3 * len(faces) / 2
-        assert len(np.unique(faces)) - edge_count + len(faces) == SPHERE
-        # Signed tetrahedra between the origin and each face (divergence theorem).
-        assert np.linalg.det(mesh.vertices[faces]).sum() / 6 > 1e-3
+    assert shape.is_watertight
+    assert shape.is_winding_consistent
+    shells = shape.split(repair=False)
+    assert len(shells) == SHELL_COUNTS[name]
+    for shell in shells:
+        assert shell.euler_number == SPHERE
+        assert shell.volume > 1e-3
     assert mesh.face_areas().min() > 1e-6
     np.testing.assert_array_equal(np.unique(mesh.faces), np.arange(len(mesh.vertices)))
     assert 0.8 < np.abs(mesh.vertices).max() < 1.05

@@ -47,8 +47,6 @@ def test_logits_costs_and_success_are_those_of_the_images(result, by_color):
 @pytest.mark.parametrize("optimizer", OPTIMIZERS)
 def test_the_sums_of_images_and_attacked_offsets_are_images(attacked, optimizer, norm):
     """Nothing reaches the target, so that a restart is drawn."""
-    if optimizer == "cma_es":
-        pytest.importorskip("cma")
     steps = {"pixels": augment.StepSettings(norm, 0.3, step_size=0.2)}
     scene = SHARED | {"backgrounds": [0.0, 1.0]}
     options = {"max_queries": 120, "max_steps": 4, "margin": 1e4, "restarts": 1, "force": True}

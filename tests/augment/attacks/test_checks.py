@@ -8,17 +8,14 @@ import augment
 from augment.attack_settings import StepSettings
 from augment.attacks.result import AttackResult, warnings
 from renderer.errors import InputError
+from tests.helpers import CHANNELS, by_channel
 
 SMALL_STEPS = {"lighting": StepSettings(step_size=0.02)}
 
 
-@pytest.fixture(scope="module")
-def slow_attack(attacked) -> AttackResult:
-    return attacked(SMALL_STEPS, {"backgrounds": [0.3, 0.5, 0.7]}, max_steps=3)
-
-
-def test_checks_tell_that_the_cost_falls_and_that_more_steps_succeed_more_often(slow_attack):
+def test_checks_tell_that_the_cost_falls_and_that_more_steps_succeed_more_often(attacked):
     """Nothing is drawn, so that a longer descent repeats the shorter one."""
+    slow_attack = attacked(SMALL_STEPS, {"backgrounds": [0.3, 0.5, 0.7]}, max_steps=3)
     checks = augment.check(slow_attack)
     descent = slow_attack.minimum
     assert checks["cost_before"] == pytest.approx(float(descent.cost_before.mean()))
@@ -129,18 +126,12 @@ def test_larger_balls_hold_the_successes_of_smaller_ones_and_more_than_random_dr
     assert (adversarial >= random).all()
 
 
-CLASSES = ("orange", "lime", "sky")
 TWO_VIEWS = {"views": 2, "backgrounds": [0.4]}
 BOTH = torch.arange(2)
 
 
-def network(classes: tuple[str, ...] = CLASSES, size: int = 12) -> augment.Classifier:
-    channels = [CLASSES.index(name) for name in classes]
-
-    def logits(images: Tensor) -> Tensor:
-        return 30 * images.mean((2, 3))[:, channels]
-
-    return augment.Classifier(logits, size, classes, f"{classes[0]}{size}")
+def network(classes=CHANNELS, size: int = 12) -> augment.Classifier:
+    return by_channel(size, classes, f"{classes[0]}{size}")
 
 
 @pytest.fixture(scope="module")

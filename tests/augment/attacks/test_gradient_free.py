@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -14,13 +12,13 @@ from renderer.errors import InputError
 from renderer.light.files import load_light
 from renderer.light.nonnegative import project_nonnegative
 
+LIGHTING = augment.StepSettings("linf", 0.2)
 OPTIMIZERS = ["random_search", "cma_es"]
 BALLS = [augment.StepSettings("linf", 0.05), augment.StepSettings("l2", 0.2)]
 
 
 @pytest.mark.parametrize(("optimizer", "ball"), [*zip(OPTIMIZERS, BALLS, strict=True)])
 def test_no_candidate_leaves_the_ball_or_has_negative_light(attacked, monkeypatch, optimizer, ball):
-    pytest.importorskip("cma")
     rendered = []
     render = SceneProblem.render
 
@@ -58,7 +56,6 @@ def logits_of_means(images: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(("optimizer", "noise"), [("random_search", 1.0), ("cma_es", 0.0)])
 @pytest.mark.filterwarnings("ignore:the light is negative")
 def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, noise, shared):
-    pytest.importorskip("cma")
     seen = []
 
     def function(images: np.ndarray) -> np.ndarray:
@@ -70,10 +67,9 @@ def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, n
     if shared:  # Similar views are fooled together.
         options["cameras"] = [OrthographicCamera(60.0, azimuth, 2.2) for azimuth in (0.0, 2.0)]
     scene = augment.build_scene([("solid:orange", 0)], 8, views=2, **options)
-    lighting = augment.StepSettings("linf", 0.2)
     options = {"max_queries": 40, "allow_negative": True, "quantized": False, "noise_margin": 1.0}
     options |= {"optimizer": optimizer, "sensor_noise": noise}
-    settings = augment.AttackSettings(lighting=lighting, **options)
+    settings = augment.AttackSettings(lighting=LIGHTING, **options)
     gray = 2  # images with which the network is checked
     result = augment.attack(function, scene, settings=settings, force=True)
     probes = 1
@@ -87,7 +83,6 @@ def test_queries_are_the_images_that_a_function_was_given_each_once(optimizer, n
 @pytest.mark.parametrize("optimizer", ["gradient", *OPTIMIZERS])
 @pytest.mark.parametrize("max_queries", [1, 20])
 def test_all_starts_together_show_at_most_that_number_of_images(attacked, optimizer, max_queries):
-    pytest.importorskip("cma")
     steps = {"lighting": augment.StepSettings("l2", 0.1)}
     options = {"optimizer": optimizer, "restarts": 2, "margin": 100.0}
     result = attacked(steps, max_queries=max_queries, **options)
@@ -104,8 +99,6 @@ def test_all_starts_together_show_at_most_that_number_of_images(attacked, optimi
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore:You are using the legacy")
 def test_a_numpy_function_and_a_file_of_onnx_give_the_adversary_of_the_torch_network(tmp_path):
-    pytest.importorskip("onnxruntime")
-    pytest.importorskip("onnx")
     with torch.random.fork_rng():
         torch.manual_seed(0)
         layers = [nn.Flatten(), nn.Linear(192, 8), nn.ReLU(), nn.Linear(8, 3)]
@@ -119,25 +112,24 @@ def test_a_numpy_function_and_a_file_of_onnx_give_the_adversary_of_the_torch_net
     path = tmp_path / "network.onnx"
     options = {"input_names": ["images"], "dynamic_axes": {"images": {0: "N"}}}
     torch.onnx.export(network, (torch.rand(1, 3, 8, 8),), path, dynamo=False, **options)
-    scene = augment.build_scene([("solid:orange", 0)], 8, rasterizer="numpy")
-    lighting = augment.StepSettings("linf", 0.2)
     search = {"optimizer": "random_search", "max_queries": 40, "allow_negative": True}
-    settings = augment.AttackSettings(lighting=lighting, **search)
     functions = [network, numpy_network, augment.load_classifier(str(path))]
-    torch_result, *others = [
-        augment.attack(function, scene, settings=settings, force=True) for function in functions
-    ]
+    torch_result, *others = [attack_orange(function, **search) for function in functions]
     assert torch_result.minimum.cost < torch_result.minimum.cost_before
     for other in others:
         assert torch.equal(other.minimum.values, torch_result.minimum.values)
         torch.testing.assert_close(other.logits, torch_result.logits, rtol=1e-4, atol=1e-5)
 
 
-def test_a_function_without_gradients_is_attacked_by_random_search_with_one_sentence():
+def attack_orange(network, classes=None, **settings) -> augment.AttackResult:
     scene = augment.build_scene([("solid:orange", 0)], 8, rasterizer="numpy")
-    settings = augment.AttackSettings(lighting=augment.StepSettings("linf", 0.2), max_queries=5)
+    chosen = augment.AttackSettings(lighting=LIGHTING, **settings)
+    return augment.attack(network, scene, settings=chosen, classes=classes, force=True)
+
+
+def test_a_function_without_gradients_is_attacked_by_random_search_with_one_sentence():
     with pytest.warns(UserWarning, match="random search attacks it with at most 5 queries"):
-        result = augment.attack(logits_of_means, scene, settings=settings, force=True)
+        result = attack_orange(logits_of_means, max_queries=5)
     assert result.settings.optimizer == "random_search"
 
 
@@ -165,16 +157,12 @@ LOSSES = {
 def test_networks_whose_images_lose_their_gradient_are_searched_or_refused(lost, is_module):
     network = Changed(LOSSES[lost]).eval()
     given = network if is_module else lambda images: network(images)
-    scene = augment.build_scene([("solid:orange", 0)], 8, rasterizer="numpy")
-    settings = augment.AttackSettings(lighting=augment.StepSettings("linf", 0.2), max_queries=5)
-    options = {"classes": ["red", "blue"], "force": True}
     with pytest.warns(UserWarning, match="random search attacks it"):
-        result = augment.attack(given, scene, settings=settings, **options)
+        result = attack_orange(given, ["red", "blue"], max_queries=5)
     assert result.settings.optimizer == "random_search"
     if lost != "rounded":
-        explicit = replace(settings, optimizer="gradient", max_queries=None)
         with pytest.raises(InputError, match="without a gradient"):
-            augment.attack(given, scene, settings=explicit, **options)
+            attack_orange(given, ["red", "blue"], optimizer="gradient")
         service = augment.AugmentationService.from_meshes([("solid:orange", 0)], 8, views=1)
         with pytest.raises(InputError, match="without a gradient"):
             service.regenerate(network, 0)
@@ -250,7 +238,6 @@ def test_rounded_probabilities_become_their_logarithms(class_count, rounded):
 def test_cma_es_warns_exactly_if_the_queries_of_a_start_pay_for_no_step(
     attacked, caplog, is_enough
 ):
-    pytest.importorskip("cma")
     steps = {"lighting": augment.StepSettings("l2", 0.1)}
     options = {"optimizer": "cma_es", "restarts": 1, "margin": 100.0}
     result = attacked(steps, max_queries=200 if is_enough else 18, **options)

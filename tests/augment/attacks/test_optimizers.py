@@ -23,12 +23,12 @@ RADII = st.one_of(st.just(0.0), st.floats(1e-3, 100))
 DRAW_COUNT = 4000
 
 
-def norms(offsets: Tensor, name: str) -> Tensor:
-    return offsets.norm(dim=1) if name == "l2" else offsets.abs().amax(1)
+# Orders of the norms, and of their dual norms.
+ORDERS = {"l2": (2, 2), "linf": (torch.inf, 1)}
 
 
-def dual_norms(offsets: Tensor, name: str) -> Tensor:
-    return offsets.norm(dim=1) if name == "l2" else offsets.abs().sum(1)
+def norms(offsets: Tensor, name: str, is_dual: bool = False) -> Tensor:
+    return offsets.norm(ORDERS[name][is_dual], dim=1)
 
 
 def project(name: str, radius: float | None, values: Tensor, center: Tensor) -> Tensor:
@@ -50,7 +50,7 @@ def test_the_projection_is_the_nearest_point_of_the_ball(name, dtype, pair, radi
     inward = (center - nearest).double()
     rounding = 16 * torch.finfo(dtype).eps * 200  # Differences are up to 200.
     assert (norms(inward, name) <= radius + rounding).all()
-    dual = dual_norms(moved, name)
+    dual = norms(moved, name, is_dual=True)
     largest_products = (moved * inward).sum(1) + radius * dual
     assert (largest_products <= rounding * (1 + dual)).all()
     # Points of the ball stay to the bit, but those at the surface may round.

@@ -41,8 +41,6 @@ SEARCHES = [pytest.param(each, marks=pytest.mark.slow) for each in ("random_sear
 
 @pytest.mark.parametrize("optimizer", ["gradient", *SEARCHES])
 def test_an_attack_succeeds_in_the_same_views_if_logits_are_multiplied(network, scene, optimizer):
-    if optimizer == "cma_es":
-        pytest.importorskip("cma")
     result = attack(network, scene, 1, optimizer)
     expected = result.success
     # All views can be attacked, and the radius separates them.

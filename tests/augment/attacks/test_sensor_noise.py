@@ -1,9 +1,11 @@
 """An image counts as adversarial if it is so after a camera's noise and 8 bits."""
 
 import math
+from types import SimpleNamespace
 
 import pytest
 import torch
+from oracles import draw_uniform
 from scipy.stats import norm
 from torch import Tensor
 
@@ -45,20 +47,17 @@ def counted(images, classifier, criterion=None) -> Tensor:
     return objective.fooled_in_views(images, predicted, torch.arange(len(images)))
 
 
-@pytest.fixture(params=[0.3, 1.5])
-def with_lead(request) -> tuple[float, Tensor]:
-    """Return images whose resemblance leads the threshold 0 by a number of deviations."""
-    draws = torch.Generator().manual_seed(1)
-    images = 0.3 + 0.4 * torch.rand(1500, 3, SIZE, SIZE, generator=draws)
-    wanted = request.param * CHANGE_BY_NOISE / (2 * GAIN)
-    missing = wanted - resemblance(images)
-    direction = PATTERN / PATTERN.square().sum()
-    return request.param, (images + missing[:, None, None, None] * direction)[:, None]
+def with_leads(images: Tensor, leads: Tensor) -> Tensor:
+    """Change images until their resemblance leads the threshold 0 by some deviations."""
+    missing = leads * CHANGE_BY_NOISE / (2 * GAIN) - resemblance(images)
+    return images + missing[:, None, None, None] * PATTERN / PATTERN.square().sum()
 
 
-def test_an_image_counts_with_the_probability_of_gaussian_noise_in_three_draws(with_lead):
+@pytest.mark.parametrize("lead", [0.3, 1.5])
+def test_an_image_counts_with_the_probability_of_gaussian_noise_in_three_draws(lead):
     """Each draw of a linear classifier succeeds with the probability Φ(lead)."""
-    lead, images = with_lead
+    images = 0.3 + 0.4 * draw_uniform(1500, 3, SIZE, SIZE, seed=1).float()
+    images = with_leads(images, torch.full((1500,), lead))[:, None]
     expected = norm.cdf(lead) ** NOISE_DRAWS
     tolerance = 4 * math.sqrt(expected * (1 - expected) / len(images))
     rate = counted(images, nervous(0.0)).double().mean().item()
@@ -165,34 +164,25 @@ def test_noise_changes_no_descent_and_no_other_random_number_and_fewer_attacks_c
     assert with_noise.success.sum() < without.success.sum()
 
 
-class StillScene:
-    def __init__(self, views: Tensor):
-        self.views = views
-        self.start = torch.zeros(1, 1)
-        self.group_size = 1
-
-    def render(self, values: Tensor, examples: Tensor) -> Tensor:
-        return self.views[None] + 0 * values[:, :, None, None, None]
-
-    def scale_gradient(self, gradient: Tensor) -> Tensor:
-        return gradient
-
-    def project(self, values: Tensor, examples: Tensor) -> Tensor:
-        return torch.zeros_like(values)
+def still_scene(views: Tensor) -> SimpleNamespace:
+    return SimpleNamespace(
+        start=torch.zeros(1, 1),
+        group_size=1,
+        render=lambda values, examples: views[None] + 0 * values[:, :, None, None, None],
+        scale_gradient=lambda gradient: gradient,
+        project=lambda values, examples: torch.zeros_like(values),
+    )
 
 
 @pytest.mark.parametrize(("leads", "steps"), [((20.0, 20.0), 0), ((20.0, 0.1), 3)])
 def test_descent_goes_on_until_every_view_leads_by_the_noise_margin(leads, steps):
     """Leads are in standard deviations of the change of the logits by noise."""
-    wanted = torch.tensor(leads) * CHANGE_BY_NOISE / (2 * GAIN)
-    gray = torch.full((2, 3, SIZE, SIZE), 0.5)
-    direction = PATTERN / PATTERN.square().sum()
-    views = gray + (wanted - resemblance(gray))[:, None, None, None] * direction
+    views = with_leads(torch.full((2, 3, SIZE, SIZE), 0.5), torch.tensor(leads))
     criterion = ClassCriterion(torch.zeros(1, 2, dtype=torch.long))
     settings = augment.AttackSettings(
         max_steps=3, margin=0.0, sensor_noise=1.0, noise_margin=1.0, quantized=False
     )
-    result = minimize(StillScene(views), Objective(nervous(0.0), criterion, settings))
+    result = minimize(still_scene(views), Objective(nervous(0.0), criterion, settings))
     assert result.success.tolist() == [True]
     assert result.steps.tolist() == [steps]
 

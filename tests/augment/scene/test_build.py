@@ -22,9 +22,9 @@ from renderer.light.environment import to_map, write_map
 from renderer.light.files import directional, load_light, probe
 from renderer.light.harmonics import quadrature
 from renderer.light.ringing import required_degree
-from renderer.mesh import Mesh
 from renderer.solids import solid
 from renderer.surface.gloss import Gloss, smallest_roughness
+from tests.helpers import images_of
 
 MATTE = ("solid:pear", "pear")
 OPTIONS = {"samples": 1, "rasterizer": "numpy"}
@@ -113,22 +113,18 @@ def test_the_gloss_of_props_counts():
     assert scene.basis == Harmonics(required_degree(0.25))
 
 
-@pytest.fixture(scope="module")
-def single_glossy_face() -> tuple[Mesh, str]:
-    """Return a pear with one face of roughness 0.25 and a smoother one that is matte."""
+def test_the_gloss_of_single_faces_and_of_other_objects_counts():
+    """One face of the pear has the roughness 0.25, and a smoother one is matte."""
     mesh = solid("pear")
     roughness = torch.full((len(mesh.faces),), 0.5)
     strength = torch.full((len(mesh.faces),), 0.5)
     roughness[3] = 0.25
     roughness[5] = 0.2
     strength[5] = 0.0
-    return Gloss(roughness, specular_factor=strength).on(mesh), "pear"
-
-
-def test_the_gloss_of_single_faces_and_of_other_objects_counts(single_glossy_face):
-    scene, _ = scene_of(MATTE, single_glossy_face)
+    pear = Gloss(roughness, specular_factor=strength).on(mesh), "pear"
+    scene, _ = scene_of(MATTE, pear)
     assert scene.basis == Harmonics(required_degree(0.25))
-    attacked, _ = scene_of(MATTE, single_glossy_face, attack=ON_UNLIMITED_MATERIAL)
+    attacked, _ = scene_of(MATTE, pear, attack=ON_UNLIMITED_MATERIAL)
     assert attacked.basis == Harmonics(required_degree(0.2))
 
 
@@ -181,12 +177,9 @@ def test_an_attack_keeps_the_degree_or_the_light_that_was_given(map_name):
 
 
 def test_degree_0_is_exact_for_even_light():
-    rows = torch.arange(1)
     low, _ = scene_of(MATTE, degree=0, light="uniform")
     usual, _ = scene_of(MATTE, light="uniform")
-    image = low.render(low.conditions(rows), rows)
-    expected = usual.render(usual.conditions(rows), rows)
-    torch.testing.assert_close(image, expected, rtol=0, atol=1e-6)
+    torch.testing.assert_close(images_of(low), images_of(usual), rtol=0, atol=1e-6)
 
 
 def irradiance_rms(light: Tensor) -> float:
@@ -216,18 +209,13 @@ def test_light_whose_irradiance_changes_as_it_is_made_physical_is_told(sky, is_t
     assert (f"irradiance is off by {error:.0%}" in told) == is_told
 
 
-@pytest.fixture
-def sun_map(tmp_path) -> str:
-    radiance = torch.zeros(64, 128, 3)
-    radiance[20, 30] = 100
-    write_map(tmp_path / "sun.npy", radiance)
-    return str(tmp_path / "sun.npy")
-
-
 @pytest.mark.parametrize(("degree", "told"), [(2, "irradiance that is off by 9%"), (4, "")])
-def test_a_light_that_a_low_degree_cuts_off_is_told(sun_map, degree, told):
+def test_a_light_that_a_low_degree_cuts_off_is_told(tmp_path, degree, told):
     """Degrees above 2 have 8.7 % of Σ (2l + 1) A_l² (Ramamoorthi and Hanrahan 2001)."""
-    _, warned = scene_of(MATTE, light=sun_map, degree=degree)
+    sun = torch.zeros(64, 128, 3)
+    sun[20, 30] = 100
+    write_map(tmp_path / "sun.npy", sun)
+    _, warned = scene_of(MATTE, light=str(tmp_path / "sun.npy"), degree=degree)
     assert told in warned
     assert bool(told) == bool(warned)
 

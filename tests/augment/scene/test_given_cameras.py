@@ -10,6 +10,7 @@ import augment
 import renderer
 from augment.augmentation_settings import VariationSettings
 from augment.scene.vary import vary
+from tests.helpers import bright_or_dark, images_of
 
 SIZE = 24
 PLACE = np.array([120.0, -40.0, 15.0])
@@ -36,11 +37,6 @@ def cameras() -> list[renderer.Camera]:
     return [pinhole, parallel, perspective]
 
 
-def images_of(scene: augment.Scene) -> torch.Tensor:
-    examples = torch.arange(len(scene))
-    return scene.render(scene.conditions(examples), examples)
-
-
 def test_a_scene_shows_a_mesh_in_its_world_as_a_render_does():
     """Vertices are rounded to float32 in the scene, which moves few samples at outlines."""
     light = renderer.load_light("grace")
@@ -52,7 +48,7 @@ def test_a_scene_shows_a_mesh_in_its_world_as_a_render_does():
     expected = renderer.render(
         mesh, cameras(), light, SIZE, samples=4, encoding=scene.settings.encoding
     )
-    found = images_of(scene)[:, 0]
+    found = images_of(scene)
     for view in range(3):
         assert (expected[view] != 0.5).any(0).float().mean() > 0.1
         difference = (found[view] - expected[view]).abs()
@@ -86,11 +82,7 @@ def test_a_pose_attack_turns_cameras_about_the_object():
 
 
 def test_an_attack_and_its_files_keep_pinhole_cameras(tmp_path):
-    def logits(images):
-        mean = images.mean((1, 2, 3))
-        return torch.stack([mean, 0.3 + 0 * mean], dim=1)
-
-    classifier = augment.Classifier(logits, size=SIZE, classes=["cup", "other"])
+    classifier = augment.Classifier(bright_or_dark, size=SIZE, classes=["cup", "other"])
     scene = placed_scene(silhouettes=True, samples=2)
     pose = augment.PoseSettings(radius=1.0)
     light = augment.StepSettings(step_size=0.5)

@@ -7,21 +7,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from oracles import Lobe, coat_albedo
+from oracles import Lobe, coat_albedo, fragments_of, operator_of
 
 from augment.scene.build import build_scene
-from renderer.camera import Camera
 from renderer.light.environment import read_map, write_map
 from renderer.light.files import mean_luminance, probe
 from renderer.light.harmonics import equirectangular
-from renderer.mesh import Mesh, normalize
-from renderer.operators.build import build_operators
+from renderer.mesh import normalize
 from renderer.operators.rays import Surface
 from renderer.settings import ImageSettings
 from renderer.solids import solid
 from renderer.surface.gloss import Gloss
-from renderer.visibility import choose
-from renderer.visibility.fragments import build_fragments
 
 HDRI = Path(__file__).parents[4] / "shared" / "data" / "hdri"
 SIZE = 32
@@ -54,13 +50,6 @@ def brdf(normals, view, light, roughness, metallic) -> np.ndarray:
     return specular + ALBEDO * diffuse
 
 
-def rendered(path: Path, mesh: Mesh) -> tuple[np.ndarray, Camera]:
-    scene = build_scene([(mesh, "pear")], SIZE, light=str(path), rasterizer="numpy")
-    camera = scene.cameras[0][0]
-    [operator] = build_operators(mesh, [camera], SETTINGS, choose("numpy"), basis=scene.basis)
-    return operator.radiance(scene.lights[0]).T.numpy(), camera
-
-
 def texels(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """Return the directions (N, 3) of a map's texels, and their power (N, 3) as in scenes."""
     radiance = read_map(path).double().clamp(min=0)
@@ -73,8 +62,7 @@ def texels(path: Path) -> tuple[np.ndarray, np.ndarray]:
 
 def integrated(path, mesh, camera, roughness, metallic) -> np.ndarray:
     """Return the radiance (P, 3) of the pear's pixels by quadrature over all texels."""
-    rasterizer = choose("numpy")
-    [view] = build_fragments(mesh.vertices, mesh.faces, [camera], SETTINGS, rasterizer)
+    view = fragments_of(mesh, camera, SETTINGS)
     surface = Surface(mesh, view, SETTINGS)
     normals = surface.normals.numpy()
     towards = surface.toward[0].numpy()
@@ -92,7 +80,10 @@ def require_close(path: Path, largest_error: float, roughness: float, metallic: 
     pear = normalize(solid("pear"))
     gray = replace(pear, corner_colors=np.full_like(pear.corner_colors, ALBEDO))
     mesh = Gloss(roughness, metallic).on(gray)
-    image, camera = rendered(path, mesh)
+    scene = build_scene([(mesh, "pear")], SIZE, light=str(path), rasterizer="numpy")
+    camera = scene.cameras[0][0]
+    operator = operator_of(mesh, camera, SETTINGS, basis=scene.basis)
+    image = operator.radiance(scene.lights[0]).T.numpy()
     expected = integrated(path, mesh, camera, roughness, metallic)
     error = np.sqrt(np.square(image - expected).mean() / np.square(expected).mean())
     assert error <= largest_error

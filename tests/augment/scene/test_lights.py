@@ -25,7 +25,6 @@ def drawn_of(model: lights.LightModel, first: dict[int, float], size=SIZE) -> li
 
 
 def irradiance_of_mitsuba(surface: Surface, emitter: dict, folder) -> np.ndarray:
-    pytest.importorskip("mitsuba")
     x, y, height = (one.expand(1, 1, *SIZE).flatten().double().numpy() for one in surface.position)
     slopes = surface.slope_right, surface.slope_down, torch.full_like(surface.slope_down, -1)
     normals = torch.cat(slopes, 1)[0].flatten(1).T.double().numpy() * [-1, 1, -1]

@@ -20,12 +20,12 @@ from renderer.errors import InputError
 from renderer.light.files import read_light, save_light
 from renderer.light.lamps import LOCAL_LIGHTS
 from renderer.visibility import choose
+from tests.helpers import by_channel
 
 SIZE = 16
 BOTH = torch.arange(2)  # indices of both examples
 PROJECTOR = ProjectorSettings(pixels=6, polar=50, azimuth=10, power=2.0, pattern=0.1)
 LAMPS = LampsSettings([[2, 0, 2], [0, 2, 2]], start=[[0.5, 0.4, 0.3], [0.1, 0.2, 0.3]])
-CLASSES = ("orange", "lime", "sky")
 NO_SKY = torch.zeros(49, 3)
 
 # A cup throws shadows on itself.
@@ -103,8 +103,7 @@ def joint_attack(request, tmp_path_factory) -> tuple[augment.AttackResult, Adver
     steps["albedo"] = StepSettings("linf", 0.1, "sign", 0.05)
     settings = augment.AttackSettings(**steps, max_steps=3, backtracking=True)
     shown = scene(exposure=0.3, lamps=replace(LAMPS, radius=request.param))
-    by_mean_color = augment.Classifier(lambda images: 30 * images.mean((2, 3)), SIZE, CLASSES)
-    done = augment.attack(by_mean_color, shown, settings=settings, force=True)
+    done = augment.attack(by_channel(SIZE), shown, settings=settings, force=True)
     before = done.images_in_views_before[0]
     written = Adversary.of(done.problem.scene, 0, done.conditions, before, done.images_in_views[0])
     folder = tmp_path_factory.mktemp("joint")
@@ -138,7 +137,6 @@ def test_an_attacked_pattern_is_written_as_an_image_and_moved_lamps_where_they_e
 
 def test_mitsuba_renders_a_joint_attack_alike(joint_attack):
     """Mitsuba samples the lights, its discs cast soft shadows, and our outlines are coarse."""
-    pytest.importorskip("mitsuba")
     from augment.attacks.files import render_again
 
     done, _, folder = joint_attack

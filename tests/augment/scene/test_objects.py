@@ -15,21 +15,16 @@ from renderer.solids import solid
 GRAY = (0.5, 0.5, 0.5)
 
 
-@pytest.fixture
-def plain_mesh(tmp_path) -> str:
+def test_a_mesh_without_colors_takes_the_given_one_which_a_metal_needs(tmp_path):
     path = str(tmp_path / "plain.stl")
     trimesh.creation.icosphere(1).export(path)
-    return path
-
-
-def test_a_mesh_without_colors_takes_the_given_one_which_a_metal_needs(plain_mesh):
     color = [0.9, 0.5, 0.1]
     metal = [0.3, 1, 1]
-    mesh = load_object(ObjectSettings(plain_mesh, "orange", color=color, gloss=metal)).mesh
+    mesh = load_object(ObjectSettings(path, "orange", color=color, gloss=metal)).mesh
     expected = np.broadcast_to(np.float32(color), mesh.corner_colors.shape)
     np.testing.assert_array_equal(mesh.corner_colors, expected)
     with pytest.raises(InputError, match="color="):
-        load_object(ObjectSettings(plain_mesh, "orange", gloss=metal))
+        load_object(ObjectSettings(path, "orange", gloss=metal))
 
 
 def test_an_object_keeps_the_sharp_edges_of_its_file_if_it_is_colored(tmp_path):

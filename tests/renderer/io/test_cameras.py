@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,9 +43,12 @@ def write_colmap(folder, model, parameters, points_of_images=("", "1.5 2.5 -1 3.
     (folder / "images.txt").write_text("\n".join(lines) + "\n")
 
 
-def write_transforms(path: Path, **entries: object) -> None:
-    """Write the two views as transforms.json, whose matrices are those from camera to world."""
-    frames = []
+def write_transforms(path: Path, of_frame: dict[str, Any] | None = None, **entries: Any) -> None:
+    """Write the two views as transforms.json, whose matrices are those from camera to world.
+
+    `of_frame` has entries of the second frame. An entry of `...` is left out.
+    """
+    frames: list[dict[str, Any]] = []
     for view, name in enumerate(NAMES):
         pose = np.eye(4)
         from_camera = ROTATIONS[view].inv()
@@ -52,7 +56,13 @@ def write_transforms(path: Path, **entries: object) -> None:
         pose[:3, :3] = from_camera.as_matrix() @ np.diag([1, -1, -1])
         pose[:3, 3] = -from_camera.apply(TRANSLATIONS[view])
         frames.append({"file_path": name, "transform_matrix": pose[: 3 + len(frames) % 2].tolist()})
-    path.write_text(json.dumps({"frames": frames, "w": WIDTH, "h": HEIGHT, **entries}))
+    frames[1] |= of_frame or {}
+    scene = {"frames": frames, "w": WIDTH, "h": HEIGHT, **entries}
+    path.write_text(json.dumps({key: value for key, value in scene.items() if value is not ...}))
+
+
+CENTER = {"cx": CENTER_X, "cy": CENTER_Y}
+ANGLE_X = 2 * math.atan(WIDTH / 2 / FOCAL_X)
 
 
 def require_expected(path: Path, focal_y: float = FOCAL_Y) -> None:
@@ -86,31 +96,28 @@ def test_a_line_of_colmap_ends_only_at_a_line_feed(tmp_path, monkeypatch):
     require_expected(tmp_path)
 
 
-def test_a_name_that_occurs_twice_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr(f"{__name__}.NAMES", ["a b.png", "a b.png"])
-    write_colmap(tmp_path, "PINHOLE", [FOCAL_X, FOCAL_Y, CENTER_X, CENTER_Y])
-    with pytest.raises(InputError, match=r"images\.txt: a b\.png occurs twice"):
-        renderer.load_cameras(tmp_path)
-    write_transforms(tmp_path / "a.json", camera_angle_x=1.0)
-    with pytest.raises(InputError, match=r"a\.json: a b\.png occurs twice"):
-        renderer.load_cameras(tmp_path / "a.json")
-
-
 OTHER_KINDS = {"is_fisheye": True, "ortho_scale": 2.5, "rolling_shutter": [0, 0, 0.1, 0]}
 OTHER_KINDS |= {"ftheta_p1": 0.4, "camera_type": "fisheye", "camera_model": "OPENCV_FISHEYE"}
 
 
-@pytest.mark.parametrize("key", OTHER_KINDS)
-@pytest.mark.parametrize("of_frame", [False, True])
-def test_entries_that_name_another_kind_of_camera_are_refused(tmp_path, key, of_frame):
-    entries = {key: OTHER_KINDS[key]}
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        *(({key: value}, key) for key, value in OTHER_KINDS.items()),
+        *(({"of_frame": {key: value}}, key) for key, value in OTHER_KINDS.items()),
+        ({"of_frame": {"file_path": NAMES[0]}}, r"a\.json: front\.png occurs twice"),
+        ({"of_frame": {"file_path": None}}, "file_path"),
+        ({"k1": 0.1}, "undistort"),
+        ({"camera_angle_x": ..., "fl_x": FOCAL_X, "w": ..., "h": ...}, "image size"),
+        ({"camera_angle_x": ...}, "no focal length"),
+    ],
+)
+def test_transforms_that_describe_no_pinhole_cameras_with_names_are_refused(
+    tmp_path, entries, message
+):
     path = tmp_path / "a.json"
-    write_transforms(path, camera_angle_x=1.0, **({} if of_frame else entries))
-    if of_frame:
-        scene = json.loads(path.read_text())
-        scene["frames"][1] |= entries
-        path.write_text(json.dumps(scene))
-    with pytest.raises(InputError, match=key):
+    write_transforms(path, **{"camera_angle_x": 1.0} | entries)
+    with pytest.raises(InputError, match=message):
         renderer.load_cameras(path)
 
 
@@ -118,11 +125,8 @@ def test_entries_that_change_no_image_are_ignored(tmp_path):
     """Poses stay in the coordinates of the file, whatever was applied to them before."""
     ignored = {"is_fisheye": False, "ortho_scale": None, "rolling_shutter": [0, 0, 0, 0]}
     ignored |= {"aabb_scale": 16, "scale": 0.5, "offset": [1, 2, 3], "applied_scale": 0.25}
-    angles = {
-        "camera_angle_x": 2 * math.atan(WIDTH / 2 / FOCAL_X),
-        "camera_angle_y": 2 * math.atan(HEIGHT / 2 / FOCAL_Y),
-    }
-    write_transforms(tmp_path / "a.json", **angles, **ignored, cx=CENTER_X, cy=CENTER_Y)
+    angles = {"camera_angle_x": ANGLE_X, "camera_angle_y": 2 * math.atan(HEIGHT / 2 / FOCAL_Y)}
+    write_transforms(tmp_path / "a.json", **angles, **ignored, **CENTER)
     require_expected(tmp_path / "a.json")
 
 
@@ -132,42 +136,27 @@ def test_a_simple_pinhole_has_one_focal_length(tmp_path):
 
 
 def test_points_are_where_cameras_of_nerfstudio_see_them(tmp_path):
-    center = {"cx": CENTER_X, "cy": CENTER_Y, "k1": 0.0}
-    write_transforms(tmp_path / "transforms.json", fl_x=FOCAL_X, fl_y=FOCAL_Y, **center)
+    write_transforms(tmp_path / "transforms.json", fl_x=FOCAL_X, fl_y=FOCAL_Y, k1=0.0, **CENTER)
     require_expected(tmp_path)
     require_expected(tmp_path / "transforms.json")
-    angle = 2 * math.atan(WIDTH / 2 / FOCAL_X)
-    write_transforms(tmp_path / "a.json", camera_angle_x=angle, **center)
+    write_transforms(tmp_path / "a.json", camera_angle_x=ANGLE_X, **CENTER)
     require_expected(tmp_path / "a.json", focal_y=FOCAL_X)
 
 
 def test_an_angle_of_a_frame_overrides_the_focal_lengths_of_the_scene(tmp_path):
     path = tmp_path / "a.json"
-    write_transforms(path, fl_x=3 * FOCAL_X, fl_y=9 * FOCAL_Y, cx=CENTER_X, cy=CENTER_Y)
-    scene = json.loads(path.read_text())
-    for frame in scene["frames"]:
-        frame["camera_angle_x"] = 2 * math.atan(WIDTH / 2 / FOCAL_X)
-    path.write_text(json.dumps(scene))
-    require_expected(path, focal_y=FOCAL_X)
-
-
-def test_an_image_of_cameras_must_have_a_name(tmp_path):
-    path = tmp_path / "transforms.json"
-    write_transforms(path, fl_x=FOCAL_X, fl_y=FOCAL_Y, cx=CENTER_X, cy=CENTER_Y)
-    scene = json.loads(path.read_text())
-    scene["frames"][0]["file_path"] = None
-    path.write_text(json.dumps(scene))
-    with pytest.raises(InputError, match="file_path"):
-        renderer.load_cameras(path)
+    of_frame = {"camera_angle_x": ANGLE_X}
+    write_transforms(path, of_frame, fl_x=3 * FOCAL_X, fl_y=9 * FOCAL_Y, **CENTER)
+    found = renderer.load_cameras(path)[NAMES[1]].project(POINTS)[:, :2]
+    np.testing.assert_allclose(found, expected_positions(1, FOCAL_X), atol=1e-9)
 
 
 @pytest.mark.parametrize("suffix", [".png", ""])
 def test_without_a_size_that_of_the_images_counts_or_that_of_both_angles(tmp_path, suffix):
     """Without both, images are square. A camera of an image shows its central square."""
-    angle_x = 2 * math.atan(WIDTH / 2 / FOCAL_X)
     angle_y = 2 * math.atan(HEIGHT / 2 / FOCAL_X)
     sized, other = tmp_path / "sized.json", tmp_path / "other.json"
-    write_transforms(sized, camera_angle_x=angle_x)
+    write_transforms(sized, camera_angle_x=ANGLE_X)
     expected = [*renderer.load_cameras(sized).values()]
     scene = json.loads(sized.read_text())
     del scene["w"], scene["h"]
@@ -182,38 +171,17 @@ def test_without_a_size_that_of_the_images_counts_or_that_of_both_angles(tmp_pat
     del scene["camera_angle_x"]
     # The image is wider than high, so its angle of y is that of its central square.
     for angles, is_same in (
-        ({"camera_angle_x": angle_x}, 0),
+        ({"camera_angle_x": ANGLE_X}, 0),
         ({"camera_angle_y": angle_y, "h": 9}, 1),
     ):
         other.write_text(json.dumps(scene | angles))
         with pytest.warns(UserWarning, match="images are square"):
             found = project()
         assert np.allclose(found[0], expected[0].project(POINTS), atol=1e-5) == is_same
-    other.write_text(json.dumps(scene))
-    with pytest.raises(InputError, match="no focal length"):
-        project()
-    other.write_text(json.dumps(scene | {"camera_angle_x": angle_x}))
+    other.write_text(json.dumps(scene | {"camera_angle_x": ANGLE_X}))
     for name in NAMES:
         Image.new("L", (WIDTH, HEIGHT)).save(tmp_path / name)
     np.testing.assert_allclose(project(), [each.project(POINTS) for each in expected], atol=1e-9)
-
-
-def test_distorted_cameras_are_refused(tmp_path):
-    write_colmap(tmp_path, "OPENCV", [FOCAL_X, FOCAL_Y, CENTER_X, CENTER_Y, 0.1, 0, 0, 0])
-    with pytest.raises(InputError, match="undistort"):
-        renderer.load_cameras(tmp_path)
-    write_transforms(tmp_path / "transforms.json", fl_x=FOCAL_X, k1=0.1)
-    with pytest.raises(InputError, match="undistort"):
-        renderer.load_cameras(tmp_path / "transforms.json")
-
-
-def test_a_focal_length_in_pixels_needs_the_image_size(tmp_path):
-    path = tmp_path / "transforms.json"
-    write_transforms(path, fl_x=FOCAL_X)
-    scene = json.loads(path.read_text())
-    path.write_text(json.dumps({key: scene[key] for key in scene if key not in ("w", "h")}))
-    with pytest.raises(InputError, match="image size"):
-        renderer.load_cameras(path)
 
 
 @pytest.mark.parametrize("content", ["", "[]", "{}", '{"frames": []}', '{"frames": [{}]}'])
@@ -224,13 +192,27 @@ def test_damaged_transforms_are_refused(tmp_path, content):
         renderer.load_cameras(path)
 
 
-def test_damaged_or_missing_files_of_colmap_are_refused(tmp_path):
+PARAMETERS = [FOCAL_X, FOCAL_Y, CENTER_X, CENTER_Y]
+
+
+@pytest.mark.parametrize(
+    ("model", "parameters", "names", "message"),
+    [
+        ("OPENCV", [*PARAMETERS, 0.1, 0, 0, 0], NAMES, "undistort"),
+        ("PINHOLE", [FOCAL_X], NAMES, r"cameras\.txt"),
+        ("PINHOLE", PARAMETERS, ["a b.png"] * 2, r"images\.txt: a b\.png occurs twice"),
+        ("PINHOLE", PARAMETERS, ["", ""], r"images\.txt"),
+    ],
+)
+def test_files_of_colmap_that_are_damaged_or_of_distorted_cameras_are_refused(
+    tmp_path, monkeypatch, model, parameters, names, message
+):
+    monkeypatch.setattr(f"{__name__}.NAMES", names)
+    write_colmap(tmp_path, model, parameters)
+    with pytest.raises(InputError, match=message):
+        renderer.load_cameras(tmp_path)
+
+
+def test_missing_files_of_colmap_are_refused(tmp_path):
     with pytest.raises(InputError, match="does not exist"):
-        renderer.load_cameras(tmp_path)
-    write_colmap(tmp_path, "PINHOLE", [FOCAL_X])
-    with pytest.raises(InputError, match=r"cameras\.txt"):
-        renderer.load_cameras(tmp_path)
-    write_colmap(tmp_path, "PINHOLE", [FOCAL_X, FOCAL_Y, CENTER_X, CENTER_Y])
-    (tmp_path / "images.txt").write_text("1 0.5 0.5\n")
-    with pytest.raises(InputError, match=r"images\.txt"):
         renderer.load_cameras(tmp_path)

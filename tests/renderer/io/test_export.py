@@ -1,14 +1,13 @@
 """Exported meshes, read by the renderer and by trimesh alone."""
 
-import json
 import math
-import struct
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import trimesh
+from gltf_files import read_tree
 from numpy.testing import assert_allclose, assert_array_equal
 from oracles import corners_of, linear_of
 from PIL import Image
@@ -154,12 +153,6 @@ def test_the_cameras_of_a_glb_project_as_ours(tmp_path):
         assert_allclose(projected[:, :2], camera.project(points)[:, :2], atol=1e-12)
         if not isinstance(camera, PinholeCamera):
             assert_allclose(projected[:, 2], camera.project(points)[:, 2], atol=1e-12)
-
-
-def read_tree(path: Path) -> dict:
-    content = path.read_bytes()
-    (length,) = struct.unpack_from("<I", content, 12)
-    return json.loads(content[20 : 20 + length])
 
 
 def gltf_projection(lens: dict) -> np.ndarray:

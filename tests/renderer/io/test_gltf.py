@@ -12,7 +12,7 @@ import pytest
 import torch
 from gltf_files import SQUARE, SQUARE_FACES, SQUARE_UVS, Gltf
 from numpy.testing import assert_allclose, assert_array_equal
-from oracles import corners_of, encoded, srgb_of
+from oracles import bilinear, corners_of, encoded, srgb_of
 from PIL import Image
 
 from renderer import errors
@@ -31,20 +31,19 @@ def albedo_at(mesh: Mesh, uvs: np.ndarray) -> np.ndarray:
     """Interpolate the linear albedo bilinearly at texture coordinates of the mesh, v up."""
     [texture] = mesh.textures
     height, width = texture.shape[:2]
-    position = np.array([uvs[:, 0] * width, (1 - uvs[:, 1]) * height]) - 0.5
-    start = np.floor(position).astype(int)
-    x, y = position - start
-    values = linear(texture / 255)
-    total = 0
-    for i, wx in ((0, 1 - x), (1, x)):
-        for j, wy in ((0, 1 - y), (1, y)):
-            texels = values[(start[1] + j) % height, (start[0] + i) % width]
-            total = total + (wx * wy)[:, None] * texels
-    return total
+    row, column = (1 - uvs[:, 1]) * height - 0.5, uvs[:, 0] * width - 0.5
+    return bilinear(linear(texture / 255), row, column)
 
 
 def triangle_corners(folder: Path, gltf: Gltf) -> np.ndarray:
     return corners_of(gltf.load(folder))
+
+
+def normals_in(folder: Path) -> np.ndarray:
+    """Return the unit normals (F, 3 corners, 3) of the only part of the file that was loaded."""
+    [part] = read_parts(folder / "mesh.gltf")
+    _, normals = part.placed()
+    return normals / np.linalg.norm(normals, axis=-1, keepdims=True)
 
 
 POINTS = np.float32([[0, 0, 0], [1, 0, 0], [0, 2, 0], [1, 2, 0], [0, 4, 1]])
@@ -78,23 +77,20 @@ def test_sparse_arrays_replace_rows_of_an_array_or_of_zeros(tmp_path, has_base):
     assert_array_equal(triangle_corners(tmp_path, gltf), [expected])
 
 
-@pytest.mark.parametrize("dtype", [np.int8, np.uint16, np.float32])
-def test_quantized_positions_are_the_integers_of_the_file(tmp_path, dtype):
+@pytest.mark.parametrize(
+    ("points", "normalized", "expected"),
+    [
+        *((POINTS[:3].astype(dtype), False, POINTS[:3]) for dtype in ("int8", "uint16", "float32")),
+        # max(c / 127, -1), and alike for 16 bits.
+        (np.diag(np.int8([-128, 127, 64])), True, np.diag([-1, 1, 64 / 127])),
+    ],
+)
+def test_quantized_positions_are_those_of_the_specification(tmp_path, points, normalized, expected):
     gltf = Gltf()
     gltf.tree["extensionsUsed"] = gltf.tree["extensionsRequired"] = ["KHR_mesh_quantization"]
     gltf.tree["nodes"][0]["scale"] = [0.5, 0.5, 0.5]
-    gltf.mesh({"POSITION": POINTS[:3].astype(dtype)})
-    assert_array_equal(triangle_corners(tmp_path, gltf), POINTS[None, :3] / 2)
-
-
-def test_normalized_integers_are_those_of_the_specification(tmp_path):
-    """max(c / 127, -1), and alike for 16 bits."""
-    gltf = Gltf()
-    gltf.tree["extensionsUsed"] = ["KHR_mesh_quantization"]
-    points = np.int8([[-128, 0, 0], [127, 0, 0], [0, 64, 0]])
-    gltf.mesh({"POSITION": gltf.array(points, normalized=True)})
-    expected = [[-1, 0, 0], [1, 0, 0], [0, 64 / 127, 0]]
-    assert_allclose(triangle_corners(tmp_path, gltf), [expected], rtol=1e-12)
+    gltf.mesh({"POSITION": gltf.array(points, normalized)})
+    assert_allclose(triangle_corners(tmp_path, gltf), expected[None] / 2, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -150,13 +146,9 @@ def test_textures_are_wrapped_as_opengl_wraps_them(tmp_path, wrap_u, wrap_v, glo
     # Position in the texture of the file, by the formula of OpenGL.
     column = (3 * points[:, 0] - 0.7) * 4 - 0.5
     row = (3 * (1 - points[:, 1]) - 0.7) * 3 - 0.5
-    expected = 0
-    for i in (0, 1):
-        for j in (0, 1):
-            x, y = np.floor(column).astype(int) + i, np.floor(row).astype(int) + j
-            weight = (1 - abs(column - x)) * (1 - abs(row - y))
-            texel = linear(texels / 255)[wrapped(y, 3, wrap_v), wrapped(x, 4, wrap_u)]
-            expected = expected + weight[:, None] * texel
+    index = np.arange(-9, 12)
+    around = texels[wrapped(index, 3, wrap_v)[:, None], wrapped(index, 4, wrap_u)]
+    expected = bilinear(linear(around / 255), row + 9, column + 9)
     assert_allclose(albedo_at(mesh, uvs), expected, atol=1e-5)
 
 
@@ -359,10 +351,7 @@ def test_morph_targets_are_added_to_each_attribute(tmp_path):
     expected = POINTS[:3] + [0, 0, 0.5] + 0.25 * np.float32([[0] * 3, [4, 0, 0], [0] * 3])
     assert_allclose(corners_of(mesh)[0], expected, atol=1e-6)
     assert_allclose(linear(mesh.corner_colors)[0], [[0.4, 0.4, 1]] * 3, atol=1e-6)
-    [part] = read_parts(tmp_path / "mesh.gltf")
-    _, normals = part.placed()
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    assert_allclose(normals, [[[math.sqrt(0.5), 0, math.sqrt(0.5)]] * 3])
+    assert_allclose(normals_in(tmp_path), [[[math.sqrt(0.5), 0, math.sqrt(0.5)]] * 3])
 
 
 def test_nodes_with_translation_rotation_and_scale_place_their_meshes(tmp_path):
@@ -379,11 +368,8 @@ def test_nodes_with_translation_rotation_and_scale_place_their_meshes(tmp_path):
     expected = np.stack([-(-y + 5), x + 6, z + 7], axis=1)
     # A mirrored face has its corners in the opposite order.
     assert_allclose(triangle_corners(tmp_path, gltf)[0], expected[[0, 2, 1]], atol=1e-6)
-    [part] = read_parts(tmp_path / "mesh.gltf")
-    _, normals = part.placed()
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     normal = np.array([0.2, 0, 0.2]) / math.sqrt(0.08)
-    assert_allclose(normals, np.broadcast_to(normal, (1, 3, 3)), atol=1e-6)
+    assert_allclose(normals_in(tmp_path), np.broadcast_to(normal, (1, 3, 3)), atol=1e-6)
 
 
 def test_copies_of_a_mesh_share_its_texture(tmp_path):
@@ -509,8 +495,19 @@ def plain(**entries: Any) -> Gltf:
     return Gltf().square(**entries)
 
 
-def with_entries(gltf: Gltf, **entries: Any) -> Gltf:
+def with_tree(material: dict[str, Any] | None = None, **entries: Any) -> Gltf:
+    """Return a square with a material and with other entries of the file."""
+    gltf = plain(**material or {})
     gltf.tree |= entries
+    return gltf
+
+
+def with_mode(mode: int, **attributes: np.ndarray) -> Gltf:
+    """Return a square of triangles (mode 4), strips (5) or others with more attributes."""
+    gltf = plain()
+    primitive = gltf.tree["meshes"][0]["primitives"][0]
+    primitive["mode"] = mode
+    primitive["attributes"] |= {name: gltf.array(array) for name, array in attributes.items()}
     return gltf
 
 
@@ -526,13 +523,13 @@ IGNORED = {
     "occlusionTexture": plain(occlusionTexture={"index": 0}),
     "emitted light": plain(emissiveFactor=[0, 1, 0]),
     "KHR_materials_clearcoat": plain(extensions={"KHR_materials_clearcoat": {}}),
-    "KHR_materials_unlit": with_entries(
-        plain(extensions={"KHR_materials_unlit": {}}), extensionsRequired=["KHR_materials_unlit"]
+    "KHR_materials_unlit": with_tree(
+        {"extensions": {"KHR_materials_unlit": {}}}, extensionsRequired=["KHR_materials_unlit"]
     ),
-    "KHR_materials_variants": with_entries(plain(), extensionsUsed=["KHR_materials_variants"]),
-    "KHR_lights_punctual": with_entries(plain(), extensionsUsed=["KHR_lights_punctual"]),
-    "animations": with_entries(plain(), animations=[{}]),
-    "other scenes": with_entries(plain(), scenes=[{"nodes": [0]}, {}]),
+    "KHR_materials_variants": with_tree(extensionsUsed=["KHR_materials_variants"]),
+    "KHR_lights_punctual": with_tree(extensionsUsed=["KHR_lights_punctual"]),
+    "animations": with_tree(animations=[{}]),
+    "other scenes": with_tree(scenes=[{"nodes": [0]}, {}]),
 }
 
 
@@ -555,11 +552,6 @@ def test_a_texture_that_is_shown_without_shading_is_the_color(tmp_path):
     assert len(record) == 1
     assert_array_equal(mesh.textures[0], color_texels(3, 4))
     assert_allclose(linear(mesh.corner_colors), np.broadcast_to([1, 1, 0.5], (2, 3, 3)), atol=1e-6)
-
-
-def two_parents() -> Gltf:
-    nodes = [{"children": [i + 1, i + 1]} for i in range(40)]
-    return with_entries(plain(), nodes=[*nodes, {"mesh": 0}])
 
 
 def changed(kind: str, **entries: Any) -> Gltf:
@@ -607,41 +599,24 @@ def short_morph_target() -> Gltf:
     return gltf
 
 
-def with_strips() -> Gltf:
-    gltf = plain()
-    gltf.tree["meshes"][0]["primitives"][0]["mode"] = 5
-    return gltf
-
-
-def with_colors_of_two_numbers() -> Gltf:
-    gltf = plain()
-    attributes = gltf.tree["meshes"][0]["primitives"][0]["attributes"]
-    attributes["COLOR_0"] = gltf.array(np.ones((4, 2), np.float32))
-    return gltf
-
-
 REFUSED = {
     "an array overlaps itself": changed("bufferViews", byteStride=0),
     "overlaps itself or leaves": changed("bufferViews", byteStride=8),
     "a morph target has 1 entries": short_morph_target(),
-    "strips or fans": with_strips(),
-    "EXT_mesh_gpu_instancing": with_entries(plain(), extensionsUsed=["EXT_mesh_gpu_instancing"]),
-    "COLOR_0": with_colors_of_two_numbers(),
-    "armature": with_entries(plain(), nodes=[{"mesh": 0, "skin": 0}]),
+    "strips or fans": with_mode(5),
+    "EXT_mesh_gpu_instancing": with_tree(extensionsUsed=["EXT_mesh_gpu_instancing"]),
+    "COLOR_0": with_mode(4, COLOR_0=np.ones((4, 2), np.float32)),
+    "armature": with_tree(nodes=[{"mesh": 0, "skin": 0}]),
     "leaves its buffer view": changed("accessors", byteOffset=-4),
-    "KHR_draco_mesh_compression": with_entries(
-        plain(), extensionsUsed=["KHR_draco_mesh_compression"]
-    ),
-    "EXT_meshopt_compression": with_entries(
-        plain(), extensionsRequired=["EXT_meshopt_compression"]
-    ),
-    "KHR_meshopt_compression": with_entries(plain(), extensionsUsed=["KHR_meshopt_compression"]),
+    "KHR_draco_mesh_compression": with_tree(extensionsUsed=["KHR_draco_mesh_compression"]),
+    "EXT_meshopt_compression": with_tree(extensionsRequired=["EXT_meshopt_compression"]),
+    "KHR_meshopt_compression": with_tree(extensionsUsed=["KHR_meshopt_compression"]),
     "KHR_texture_basisu": basis_texture(),
-    "two parents": two_parents(),
-    "child of itself": with_entries(plain(), nodes=[{"mesh": 0}, {"children": [1]}]),
-    "number 7 of 1 nodes": with_entries(plain(), scenes=[{"nodes": [7]}]),
-    "number -1 of 1 meshes": with_entries(plain(), nodes=[{"mesh": -1}]),
-    "glTF 1.0": with_entries(plain(), asset={"version": "1.0"}),
+    "two parents": with_tree(nodes=[*({"children": [i + 1] * 2} for i in range(40)), {"mesh": 0}]),
+    "child of itself": with_tree(nodes=[{"mesh": 0}, {"children": [1]}]),
+    "number 7 of 1 nodes": with_tree(scenes=[{"nodes": [7]}]),
+    "number -1 of 1 meshes": with_tree(nodes=[{"mesh": -1}]),
+    "glTF 1.0": with_tree(asset={"version": "1.0"}),
     "ends behind its buffer": changed("bufferViews", byteLength=10**6),
     "differ in texture coordinates": different_places(),
     "cuts out all faces": plain(

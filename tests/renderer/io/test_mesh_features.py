@@ -154,7 +154,7 @@ ROWS = [
         for line in each(
             "d 0.5|d -halo 0.5|Tr 0.5|map_d red.png|disp red.png|decal red.png|Kd 1 0|Kd red|"
             "Kd 2 0 0|Kd -1 0 0|Kd nan 0 0|Kd 1.#IND 0 0|Kd spectral red.rfl|map_Kd|"
-            "map_Kd missing.png|map_Kd mesh.obj|newmtl m"
+            "Kd xyz 1 0 0|\0|map_Kd missing.png|map_Kd mesh.obj|newmtl m"
         )
     ),
     *(

@@ -1,6 +1,5 @@
 """Meshes from files of every format that the tests write, with their colors and textures."""
 
-import base64
 import json
 import math
 import os
@@ -14,19 +13,13 @@ import pytest
 import trimesh
 from gltf_files import Gltf
 from numpy.testing import assert_allclose, assert_array_equal
-from oracles import corners_of, encoded, srgb_of
-from PIL import Image
-from trimesh.visual.material import PBRMaterial
-from trimesh.visual.texture import TextureVisuals
+from oracles import corners_of, encoded
 
 from renderer.errors import InputError
 from renderer.io.meshes import load_mesh
 from renderer.mesh import Mesh
 
 TEXTURE = np.random.default_rng(0).integers(0, 256, (4, 6, 3)).astype(np.uint8)
-# Colors as bytes in a file, and as encoded sRGB values in a mesh.
-COLOR_BYTES = [51, 102, 255, 255]
-COLOR = [srgb_of(0.2), srgb_of(0.4), 1]
 VERTICES = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
 OBJ = VERTICES + "vt 0 0\nvt 1 0\nvt 0 1\nusemtl peel\nf 1/1 2/2 3/3\n"
 PLY = """ply
@@ -46,10 +39,6 @@ end_header
 0 1 0 0 1
 3 0 1 2
 """
-
-
-def assert_close(found: np.ndarray, expected: Any) -> None:
-    assert_allclose(found, np.broadcast_to(expected, found.shape), rtol=1e-6, atol=1e-6)
 
 
 def write(path: Path, content: str | bytes) -> Path:
@@ -80,12 +69,6 @@ def has_texture(mesh: Mesh) -> bool:
     return len(mesh.textures) == 1 and np.array_equal(mesh.textures[0], TEXTURE)
 
 
-def faces_point_outward(corners: np.ndarray) -> bool:
-    a, b, c = corners.swapaxes(0, 1)
-    from_center = corners.mean(axis=1) - corners.mean(axis=(0, 1))
-    return bool(((from_center * np.cross(b - a, c - a)).sum(axis=1) > 0).all())
-
-
 def test_an_stl_is_white_and_its_corners_are_joined(tmp_path):
     """The format repeats a vertex in each of its faces."""
     box = trimesh.creation.box()
@@ -94,39 +77,6 @@ def test_an_stl_is_white_and_its_corners_are_joined(tmp_path):
     assert len(mesh.vertices) == 8
     assert_array_equal(corners_of(mesh), box.triangles)
     assert_array_equal(mesh.corner_colors, np.ones((12, 3, 3)))
-
-
-UVS_OF_FRUIT = np.random.default_rng(2).random((8, 2))
-
-
-def fruit_and_leaf() -> trimesh.Scene:
-    fruit = trimesh.creation.box()
-    material = PBRMaterial(baseColorTexture=Image.fromarray(TEXTURE))
-    fruit.visual = TextureVisuals(uv=UVS_OF_FRUIT, material=material)
-    leaf = trimesh.creation.box((0.2, 0.4, 0.6))
-    leaf.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=COLOR_BYTES))
-    mirrored = np.diag([-2.0, 1, 1, 1])
-    moved = trimesh.transformations.translation_matrix([1, 2, 3])
-    scene = trimesh.Scene()
-    scene.add_geometry(fruit, geom_name="fruit", transform=mirrored)
-    scene.add_geometry(leaf, geom_name="leaf", transform=moved)
-    return scene
-
-
-def test_the_parts_of_a_glb_scene_have_their_materials_and_texture_coordinates(tmp_path):
-    fruit_and_leaf().export(tmp_path / "scene.glb")
-    fruit_mesh = load_mesh(tmp_path / "scene.glb")
-    is_fruit = fruit_mesh.texture_ids == 0
-    assert has_texture(fruit_mesh)
-    assert_array_equal(fruit_mesh.corner_colors[is_fruit], np.ones((12, 3, 3)))
-    assert_close(fruit_mesh.corner_colors[~is_fruit], COLOR)
-    uv_of_vertex = {}
-    for (x, y, z), uv in zip(trimesh.creation.box().vertices, UVS_OF_FRUIT, strict=True):
-        # The part is mirrored, twice as wide, and turned from y up to z up.
-        uv_of_vertex[(-2 * x, -z, y)] = uv
-    corners = corners_of(fruit_mesh)[is_fruit]
-    expected = [[uv_of_vertex[tuple(corner)] for corner in face] for face in corners]
-    assert_close(fruit_mesh.corner_uvs[is_fruit], expected)
 
 
 @pytest.mark.parametrize(
@@ -145,8 +95,9 @@ def test_the_axis_that_is_up_becomes_z(tmp_path, suffix, up, center):
     box.apply_translation([10, 20, 30])
     box.export(tmp_path / f"box.{suffix}")
     mesh = load_mesh(tmp_path / f"box.{suffix}", up)
-    assert_close(mesh.vertices.mean(axis=0), center)
-    assert faces_point_outward(corners_of(mesh))
+    assert_allclose(mesh.vertices.mean(axis=0), center, rtol=1e-6)
+    # The faces point outward.
+    assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).volume > 0
 
 
 def test_unused_vertices_are_removed_and_both_zeros_are_one_position(tmp_path):
@@ -172,11 +123,6 @@ def test_textures_of_obj_are_found_by_the_names_of_any_system(tmp_path, texture,
     (folder / location).parent.mkdir(exist_ok=True)
     write(folder / location, encoded(TEXTURE))
     assert has_texture(load_mesh(path))
-
-
-def test_an_image_inside_of_a_gltf_is_read(tmp_path):
-    uri = "data:image/png;base64," + base64.b64encode(encoded(TEXTURE)).decode()
-    assert has_texture(load_mesh(write_gltf(tmp_path, {"uri": uri})))
 
 
 def test_names_and_comments_of_an_obj_may_be_latin_1(tmp_path):

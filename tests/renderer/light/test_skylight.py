@@ -10,6 +10,7 @@ import fit_skylight
 import numpy as np
 import pytest
 import torch
+from oracles import relative_error
 from safetensors.torch import load_file
 from scipy.integrate import cubature
 from scipy.spatial.transform import Rotation
@@ -30,11 +31,6 @@ def coefficients(zenith: Any, azimuth: Any, turbidity: Any) -> torch.Tensor:
     """Return the coefficients of a sky whose angles are in radians, as in the paper."""
     degrees = 180 / math.pi
     return skylight.coefficients(degrees * zenith, degrees * azimuth, turbidity)
-
-
-def relative_error(approximate: torch.Tensor, exact: np.ndarray) -> float:
-    error = np.asarray(approximate) - exact
-    return float(np.linalg.norm(error) / np.linalg.norm(exact))
 
 
 def weighted_sky(angles: np.ndarray, sky: tuple[float, float, float]) -> np.ndarray:

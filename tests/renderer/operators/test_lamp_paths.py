@@ -8,25 +8,29 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import draw, draw_uniform, image_of, mesh_of
+from oracles import (
+    draw,
+    draw_uniform,
+    fragments_of,
+    image_of,
+    mesh_of,
+    operator_of,
+    path_traced,
+    square,
+)
 from torch import Tensor
 
 from renderer import mitsuba_scene
 from renderer.camera import OrthographicCamera
 from renderer.light.basis import HARMONICS, LocalBasis, SumBasis
-from renderer.light.environment import write_map
 from renderer.light.lamps import Lamps, Projector
 from renderer.mesh import Mesh, concatenate
-from renderer.mitsuba_scene import SCENE, render_mitsuba_scene, write_mitsuba_scene
 from renderer.operators.apply import TransferOperator
-from renderer.operators.build import build_operators
 from renderer.operators.rays import LocalLightView, Rays, Surface
 from renderer.rendering import render
 from renderer.settings import ImageSettings
 from renderer.surface.albedo import surface_albedo
 from renderer.surface.gloss import Gloss
-from renderer.visibility import choose
-from renderer.visibility.fragments import build_fragments
 
 CAMERA = OrthographicCamera(51.6, 22.9, 2.2)
 PROJECTOR = Projector(pixels=7, polar=28.6, azimuth=91.7, distance=3.0, fov=35.0)
@@ -48,17 +52,12 @@ def ball(subdivisions: int = 2) -> Mesh:
 def ball_on_a_table() -> Mesh:
     shape = trimesh.creation.icosphere(subdivisions=2, radius=0.45)
     shape.apply_translation([0, 0, 0.45])
-    table = Mesh.plain(
-        [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]], BLUE
-    )
-    return concatenate([mesh_of(shape, ORANGE), table])
+    return concatenate([mesh_of(shape, ORANGE), square(1, color=BLUE)])
 
 
-def operator_of(mesh, basis, size=SIZE, samples=SAMPLES) -> TransferOperator:
+def operator_under(basis, mesh, size=SIZE, samples=SAMPLES) -> TransferOperator:
     settings = ImageSettings(size, samples)
-    options = {"basis": basis, "dtype": torch.float64}
-    [operator] = build_operators(mesh, [CAMERA], settings, choose("numpy"), **options)
-    return operator
+    return operator_of(mesh, CAMERA, settings, basis=basis, dtype=torch.float64)
 
 
 def canvas(operator: TransferOperator, light: Tensor) -> np.ndarray:
@@ -67,8 +66,7 @@ def canvas(operator: TransferOperator, light: Tensor) -> np.ndarray:
 
 def mitsuba_image(folder: Path, mesh: Mesh, basis: LocalBasis, light: Tensor) -> np.ndarray:
     """Render each local light alone, since Mitsuba would choose one of several at random."""
-    pytest.importorskip("mitsuba")
-    write_map(folder / "light.exr", torch.zeros(8, 16, 3))
+    no_sky, settings = torch.zeros(49, 3), ImageSettings(SIZE)
     lights = [(basis, light)]
     if isinstance(basis, Lamps):
         lights = [
@@ -77,9 +75,7 @@ def mitsuba_image(folder: Path, mesh: Mesh, basis: LocalBasis, light: Tensor) ->
         ]
     total = torch.zeros(3, SIZE, SIZE, dtype=torch.float64)
     for placed in lights:
-        settings = ImageSettings(SIZE)
-        write_mitsuba_scene(folder, mesh, 1.0, [CAMERA], settings, "light.exr", [placed])
-        total += render_mitsuba_scene(folder / SCENE, 1, (SIZE, SIZE))[0, :3]
+        total += path_traced(folder, mesh, [CAMERA], no_sky, settings, lights=[placed])[0, :3]
     return total.permute(1, 2, 0).numpy()
 
 
@@ -92,7 +88,7 @@ def test_images_are_mitsubas(make_mesh, basis, sample_count, tmp_path, monkeypat
     """The direct light of a point has noise only at edges of patterns, shadows and silhouettes."""
     monkeypatch.setattr(mitsuba_scene, "SAMPLES", sample_count)
     light = 2 * draw_uniform(basis.size, 3, seed=1)
-    found = canvas(operator_of(make_mesh(), basis), light)
+    found = canvas(operator_under(basis, make_mesh()), light)
     expected = mitsuba_image(tmp_path, make_mesh(), basis, light)
     error = np.abs(found - expected)
     brightest = expected.max()
@@ -113,7 +109,7 @@ def test_a_screen_at_the_origin_shows_the_pattern_upright_and_with_its_brightnes
     corners = 3 * np.array([-right - up, right - up, right + up, up - right])
     screen = Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]])
     pattern = draw_uniform(4, 4, 3)
-    shown = canvas(operator_of(screen, projector, size=4, samples=3), pattern.flatten(0, 1))
+    shown = canvas(operator_under(projector, screen, size=4, samples=3), pattern.flatten(0, 1))
     np.testing.assert_allclose(shown, pattern, rtol=1e-12)
 
 
@@ -124,9 +120,7 @@ class LitView:
         self.mesh = mesh
         self.basis = basis
         self.settings = ImageSettings(size, samples, normals=normals)
-        [self.view] = build_fragments(
-            mesh.vertices, mesh.faces, [CAMERA], self.settings, choose("numpy"), mesh.closed
-        )
+        self.view = fragments_of(mesh, CAMERA, self.settings, mesh.closed)
         self.albedo = surface_albedo(mesh, self.view, self.settings.encoding)
 
     def moved_lamps(self, positions: Tensor, powers: Tensor) -> Tensor:
@@ -145,7 +139,7 @@ def test_moved_lamps_give_the_radiance_and_shadows_of_lamps_at_these_positions(b
     positions = torch.tensor([[2.0, -1.0, 1.5], [-0.4, 1.7, 2.5]], dtype=torch.float64)
     powers = draw_uniform(2, 3)
     moved = LitView(ball_on_a_table(), basis, SIZE, 4).moved_lamps
-    operator = operator_of(ball_on_a_table(), basis.moved(positions), samples=4)
+    operator = operator_under(basis.moved(positions), ball_on_a_table(), samples=4)
     found = moved(positions, powers)
     torch.testing.assert_close(found, operator.radiance(powers), rtol=1e-12, atol=1e-14)
     one_lamp = moved(positions[:1], powers[:1])
@@ -241,13 +235,10 @@ def test_rays_to_discs_are_more_only_if_many_samples_have_narrow_highlights():
 
 def test_a_surface_behind_a_lamp_casts_no_shadow():
     """The lamp is between two screens. The camera sees the lower one past the upper one."""
-    square = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    upper_square = 0.2 * square + [0, 0, 1.0]
-    faces = [[0, 1, 2], [0, 2, 3]]
-    screens = concatenate([Mesh.plain(square, faces), Mesh.plain(upper_square, faces)])
+    screens = concatenate([square(1), square(0.2, center=(0, 0, 1))])
     lamp = Lamps(((0.0, 0.0, 0.5),))
     power = torch.ones(1, 3, dtype=torch.float64)
-    shown = canvas(operator_of(screens, lamp, size=5, samples=1), power)
+    shown = canvas(operator_under(lamp, screens, size=5, samples=1), power)
     # Directly below the lamp, the irradiance is 1 / 0.5². It is less elsewhere.
     assert shown.max() == pytest.approx(4.0, rel=0.2)
 
@@ -257,9 +248,9 @@ def test_sparse_and_dense_transfer_give_equal_radiance_and_gradient(monkeypatch,
     basis = SumBasis((HARMONICS, Projector(16, 28.6, 91.7, 3.0, 45.8)))
     mesh = make_mesh()
     monkeypatch.setattr("renderer.operators.build.SMALL_MATRIX_SIZE", 0)
-    sparse = operator_of(mesh, basis, samples=2)
+    sparse = operator_under(basis, mesh, samples=2)
     monkeypatch.setattr("renderer.operators.build.SPARSE_FRACTION", 0)
-    dense = operator_of(mesh, basis, samples=2)
+    dense = operator_under(basis, mesh, samples=2)
     assert dense.sparse is None
     # Only the lit entries of the projector are sparse.
     assert len(sparse.nonzero) == len(HARMONICS.nonzero)

@@ -4,33 +4,21 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import draw, mesh_of, patchwork
+from oracles import draw, mesh_of, operator_of, patchwork, square
 from torch import Tensor
 
 from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.image import decode, encode
-from renderer.mesh import Mesh
 from renderer.operators.apply import TransferOperator
-from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings
-from renderer.visibility import choose
 
-EPS = torch.finfo(torch.float64).eps
+DOUBLE = torch.float64
+EPS = torch.finfo(DOUBLE).eps
 # The image of this camera has +y to the right and -x up, from -1 to 1.
 ABOVE = OrthographicCamera(0, 0, 2.0)
 [IN_FRONT] = orbit_cameras(1, 2.2)
 SIZE = 6
-
-
-def operator_of(mesh, camera, settings, dtype=torch.float32) -> TransferOperator:
-    [operator] = build_operators(mesh, [camera], settings, choose("numpy"), dtype=dtype)
-    return operator
-
-
-def square(half: float, center: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Mesh:
-    corners = half * np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    return Mesh.plain(corners + center, [[0, 1, 2], [0, 2, 3]])
 
 
 def test_the_coverage_of_a_square_on_sample_borders_is_its_area_in_each_pixel():
@@ -54,11 +42,6 @@ LAYOUTS = {
 }
 
 
-def multiply(operator: TransferOperator, lights: Tensor) -> Tensor:
-    reaching = lights[..., operator.nonzero, :].to(operator.transfer.dtype)
-    return torch.einsum("...kc,ckp->...cp", reaching, operator.by_channel)
-
-
 def background_of(kind: str, batch: tuple[int, ...]) -> float | Tensor:
     if kind == "gray":
         return 0.3
@@ -78,7 +61,9 @@ def compose(operator: TransferOperator, lights: Tensor, background: float | Tens
     behind = behind.expand(*lights.shape[:-2], 3, size, size).flatten(-2)
     uncovered = 1 - operator.coverage.to(lights)
     background_radiance = uncovered * decode(behind[..., operator.pixels], encoding)
-    values = multiply(operator, lights) + background_radiance
+    reaching = lights[..., operator.nonzero, :].to(operator.transfer.dtype)
+    radiance = torch.einsum("...kc,ckp->...cp", reaching, operator.by_channel)
+    values = radiance + background_radiance
     images = behind.clone()
     images[..., operator.pixels] = encode(values.clamp(0, 1), encoding)
     return images.unflatten(-1, (size, size))
@@ -98,7 +83,7 @@ def compose(operator: TransferOperator, lights: Tensor, background: float | Tens
 @pytest.mark.parametrize(("mesh", "samples"), LAYOUTS.values(), ids=LAYOUTS)
 def test_image_and_gradient_are_those_of_plain_operations(mesh, samples, batch, kind, encoding):
     """At least a tenth of the values of visible meshes is clamped."""
-    operator = operator_of(mesh, IN_FRONT, ImageSettings(SIZE, samples, encoding), torch.float64)
+    operator = operator_of(mesh, IN_FRONT, ImageSettings(SIZE, samples, encoding), dtype=DOUBLE)
     lights = draw(*batch, 49, 3).requires_grad_()
     upstream = draw(*batch, 3, SIZE, SIZE, seed=1)
     background = background_of(kind, batch)
@@ -149,12 +134,3 @@ def test_an_invalid_gradient_of_a_loss_is_refused(loss_gradient, argument):
     operator = operator_of(square(0.5), ABOVE, ImageSettings(4, 2))
     with pytest.raises(InputError, match=f"^{argument}"):
         operator.image_and_gradient(0.1 * draw(49, 3).float(), loss_gradient)
-
-
-def test_second_derivatives_are_refused_instead_of_wrong():
-    operator = operator_of(square(0.5), ABOVE, ImageSettings(4, 2))
-    light = (0.1 * draw(49, 3)).requires_grad_()
-    loss = operator.image(light).square().sum()
-    [gradient] = torch.autograd.grad(loss, light, create_graph=True)
-    with pytest.raises(RuntimeError, match="second derivatives"):
-        gradient.sum().backward()

@@ -10,7 +10,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 import trimesh
-from oracles import mesh_of, scipy_basis
+from oracles import mesh_of, operator_of, scipy_basis, square
 from torch import Tensor
 
 from renderer.camera import OrthographicCamera, orbit_cameras
@@ -21,10 +21,8 @@ from renderer.mesh import Mesh
 from renderer.operators import rays
 from renderer.operators import shadows as precomputed
 from renderer.operators.apply import TransferOperator
-from renderer.operators.build import build_operators
 from renderer.rendering import precompute_transfer, render
 from renderer.settings import ImageSettings
-from renderer.visibility import choose
 
 ABOVE = OrthographicCamera(0, 0, 2.0)
 EPS32 = torch.finfo(torch.float32).eps
@@ -33,10 +31,9 @@ EPS32 = torch.finfo(torch.float32).eps
 QUADRATURE_ERROR = 0.015
 
 
-def operator_of(mesh, camera=ABOVE, size=6, samples=1, shadows=True, bounces=0, normals="flat"):
+def shaded(mesh, camera=ABOVE, size=6, samples=1, shadows=True, bounces=0, normals="flat"):
     settings = ImageSettings(size, samples, normals=normals, shadows=shadows, bounces=bounces)
-    [operator] = build_operators(mesh, [camera], settings, choose("numpy"), dtype=torch.float64)
-    return operator
+    return operator_of(mesh, camera, settings, dtype=torch.float64)
 
 
 def all_rows(operator: TransferOperator) -> Tensor:
@@ -62,29 +59,25 @@ def dented(seed: int = 0) -> Mesh:
 
 
 def pit(depth: float) -> Mesh:
-    square = [(-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)]
-    floor = [[x, y, 0] for x, y in square]
-    rim = [[x, y, depth] for x, y in square]
-    faces = [[0, 1, 2], [0, 2, 3]]
+    floor, rim = square(0.5), square(0.5, center=(0, 0, depth))
+    faces = floor.faces.tolist()
     for a, b in [(0, 1), (1, 2), (2, 3), (3, 0)]:
         faces += [[a, 4 + a, b], [b, 4 + a, 4 + b]]
-    return Mesh.plain(floor + rim, faces)
+    return Mesh.plain(np.concatenate([floor.vertices, rim.vertices]), faces)
 
 
 CONVEX = {
     "a ball": mesh_of(trimesh.creation.icosphere(subdivisions=2)),
     "a cube": mesh_of(trimesh.creation.box()),
-    "an open square": Mesh.plain(
-        [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], [[0, 1, 2], [0, 2, 3]]
-    ),
+    "an open square": square(1),
 }
 
 
 @pytest.mark.parametrize(("name", "bounces"), [*zip(CONVEX, (0, 2, 0), strict=True)])
 def test_a_convex_mesh_has_the_operator_of_direct_light_to_the_bit(name, bounces):
     camera = OrthographicCamera(57.3, 17.2, 2.2)
-    direct = operator_of(CONVEX[name], camera, shadows=False)
-    shadowed = operator_of(CONVEX[name], camera, bounces=bounces)
+    direct = shaded(CONVEX[name], camera, shadows=False)
+    shadowed = shaded(CONVEX[name], camera, bounces=bounces)
     assert torch.equal(shadowed.transfer, direct.transfer)
     assert torch.equal(shadowed.nonzero, nonzero_coefficients(6))
 
@@ -106,7 +99,7 @@ def test_a_face_blocks_the_light_from_below_it_that_smooth_normals_would_receive
     camera = OrthographicCamera(0, 0, 2.1)
     hull = trimesh.convex.convex_hull(np.concatenate([np.eye(3), -np.eye(3)]))
     octahedron = Mesh.plain(hull.vertices, hull.faces, crease=180)
-    operator = operator_of(octahedron, camera, size=8, normals="smooth", bounces=2)
+    operator = shaded(octahedron, camera, size=8, normals="smooth", bounces=2)
     points = points_on_octahedron(operator, camera)
     normals = points / np.linalg.norm(points, axis=1, keepdims=True)
     face_normals = np.sign(points) / math.sqrt(3)
@@ -123,8 +116,8 @@ def test_a_face_blocks_the_light_from_below_it_that_smooth_normals_would_receive
 
 def test_a_mesh_with_too_many_faces_to_compare_is_found_convex_by_its_rays(monkeypatch):
     monkeypatch.setattr(rays, "MAX_COMPARISONS", 0)
-    assert torch.equal(operator_of(CONVEX["a ball"]).nonzero, nonzero_coefficients(6))
-    assert len(operator_of(dented()).nonzero) == 49
+    assert torch.equal(shaded(CONVEX["a ball"]).nonzero, nonzero_coefficients(6))
+    assert len(shaded(dented()).nonzero) == 49
 
 
 @pytest.mark.parametrize("bounces", [0, 1])
@@ -132,7 +125,7 @@ def test_a_face_without_area_leaves_the_transfer_finite(bounces, monkeypatch):
     monkeypatch.setattr(precomputed, "PATCHES", 2**7)
     heap = hard.heap()
     faces = np.concatenate([heap.faces[:-1], [[0, 0, 1]]])
-    operator = operator_of(replace(heap, faces=faces), bounces=bounces)
+    operator = shaded(replace(heap, faces=faces), bounces=bounces)
     assert operator.transfer.isfinite().all()
 
 
@@ -143,20 +136,20 @@ def test_the_sky_over_the_center_of_a_pit_has_the_configuration_factor_of_a_squa
     hypotenuse = math.hypot(1, half_side)
     expected = 4 * half_side / (math.pi * hypotenuse) * math.atan(half_side / hypotenuse)
     camera = OrthographicCamera(0, 0, 0.01)
-    [found] = sky_fraction(operator_of(pit(depth), camera, size=1))[0].tolist()
+    [found] = sky_fraction(shaded(pit(depth), camera, size=1))[0].tolist()
     assert found == pytest.approx(expected, abs=QUADRATURE_ERROR)
 
 
 def test_the_walls_of_a_pit_that_is_small_beside_the_mesh_hide_the_sky():
     """The pit has a five hundredth of the mesh's size. The rest of the mesh is below it."""
     scale = 1 / 500
-    whole = operator_of(pit(1.0), OrthographicCamera(0, 0, 0.01), size=1)
+    whole = shaded(pit(1.0), OrthographicCamera(0, 0, 0.01), size=1)
     small = pit(1.0)
     far_below = np.array([[0.0, 0.0, -1.0], [0.1, 0.0, -1.0], [0.0, 0.1, -1.0]])
     vertices = np.concatenate([scale * small.vertices, far_below])
     far_face = len(small.vertices) + np.arange(3)
     mesh = Mesh.plain(vertices, np.concatenate([small.faces, far_face[None]]))
-    scaled = operator_of(mesh, OrthographicCamera(0, 0, 0.01 * scale), size=1)
+    scaled = shaded(mesh, OrthographicCamera(0, 0, 0.01 * scale), size=1)
     torch.testing.assert_close(sky_fraction(scaled), sky_fraction(whole), rtol=0, atol=0.01)
 
 
@@ -168,7 +161,7 @@ def test_the_second_bounce_in_a_sphere_with_a_hole_has_its_closed_form(monkeypat
     inside_out = ball.faces[heights < 0.6][:, ::-1]
     mesh = Mesh.plain(ball.vertices, inside_out, (0.8, 0.8, 0.8))
     direct, one_bounce, two_bounces = (
-        float(sky_fraction(operator_of(mesh, bounces=bounces)).mean()) for bounces in range(3)
+        float(sky_fraction(shaded(mesh, bounces=bounces)).mean()) for bounces in range(3)
     )
     # The hole z > 0.6 has 20% of the area, and the albedo is 0.8.
     expected = 0.8 * 0.8 * (one_bounce - direct)
@@ -176,11 +169,11 @@ def test_the_second_bounce_in_a_sphere_with_a_hole_has_its_closed_form(monkeypat
 
 
 def test_a_hidden_sheet_just_below_a_floor_reflects_no_light():
-    def square(corner, first, second) -> np.ndarray:
+    def rectangle(corner, first, second) -> np.ndarray:
         return np.array([np.zeros(3), first, np.add(first, second), second]) + corner
 
-    floor = square([-1, -1, 0.03], [2, 0, 0], [0, 2, 0])
-    wall = square([-1, -1, 0.03], [0, 2, 0], [0, 0, 2])
+    floor = rectangle([-1, -1, 0.03], [2, 0, 0], [0, 2, 0])
+    wall = rectangle([-1, -1, 0.03], [0, 2, 0], [0, 0, 2])
     images = []
     for squares, colors in (
         ((floor, wall), (0.8, 0.8)),
@@ -214,10 +207,10 @@ def test_a_white_mesh_in_a_white_furnace_brightens_with_bounces_to_the_sky(name,
     monkeypatch.setattr(precomputed, "PATCHES", 2**7)
     mesh, samples, tolerance = WHITE_MESHES[name]
     white = replace(mesh, corner_colors=np.ones_like(mesh.corner_colors))
-    fraction = sky_fraction(operator_of(white, size=8, samples=samples))
+    fraction = sky_fraction(shaded(white, size=8, samples=samples))
     assert -QUADRATURE_ERROR <= fraction.min() < 0.96
     for bounces in (1, 2, 100):
-        operator = operator_of(white, size=8, samples=samples, bounces=bounces)
+        operator = shaded(white, size=8, samples=samples, bounces=bounces)
         brighter_fraction = sky_fraction(operator)
         assert (brighter_fraction >= fraction - 1e-9).all()
         assert brighter_fraction.max() <= 1 + 1e-9
@@ -228,7 +221,7 @@ def test_a_white_mesh_in_a_white_furnace_brightens_with_bounces_to_the_sky(name,
 def test_shadows_without_embree_are_refused(monkeypatch):
     monkeypatch.setitem(sys.modules, "embreex.rtcore_scene", None)
     with pytest.raises(InputError, match="embreex"):
-        operator_of(dented())
+        shaded(dented())
 
 
 @pytest.mark.parametrize("degree", [2, 6])
@@ -256,7 +249,7 @@ def render_gradients(normals: str, shadows: bool) -> tuple[Tensor, ...]:
 @pytest.mark.parametrize("normals", ["flat", "smooth"])
 def test_the_gradient_by_the_light_contains_shadows_and_that_by_the_vertices_does_not(normals):
     by_light, by_vertices = render_gradients(normals, shadows=True)
-    operator = operator_of(dented(), samples=2, normals=normals)
+    operator = shaded(dented(), samples=2, normals=normals)
     torch.testing.assert_close(by_light, all_rows(operator).sum(2).T)
     _, expected = render_gradients(normals, shadows=False)
     assert torch.equal(by_vertices, expected)

@@ -2,20 +2,18 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
+from oracles import fragments_of, square
 from torch import Tensor
 
 from renderer.camera import OrthographicCamera
 from renderer.light.files import load_light
-from renderer.mesh import Mesh, concatenate, normalize
+from renderer.mesh import concatenate, normalize
 from renderer.operators.rays import DIRECTIONS, Rays, Surface, ray_directions
 from renderer.rendering import render
 from renderer.settings import ImageSettings
 from renderer.solids import solid
-from renderer.visibility import choose
-from renderer.visibility.fragments import build_fragments
 
 ABOVE = OrthographicCamera(0, 0, 2.0)
 SIZE = 4
@@ -24,12 +22,9 @@ SAMPLES = 8
 
 def starts_of_rays(sample_count: int) -> Tensor:
     """Return the sample of its pixel (pixels, DIRECTIONS) from which each ray of a floor starts."""
-    corners = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]])
-    faces = [[0, 1, 2], [0, 2, 3]]
-    higher_square = Mesh.plain(corners + np.array([3, 0, 1]), faces)
-    mesh = concatenate([Mesh.plain(corners, faces), higher_square])
+    mesh = concatenate([square(1), square(1, center=(3, 0, 1))])
     settings = ImageSettings(SIZE, SAMPLES)
-    [fragments] = build_fragments(mesh.vertices, mesh.faces, [ABOVE], settings, choose("numpy"))
+    fragments = fragments_of(mesh, ABOVE, settings)
     in_pixel = torch.arange(SAMPLES**2).repeat(SIZE**2)
     names = ("sample_to_pixel", "sample_to_seen_face", "sample_numbers")
     kept = {name: getattr(fragments, name)[in_pixel < sample_count] for name in names}

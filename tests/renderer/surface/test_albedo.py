@@ -6,30 +6,24 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import draw_uniform, linear_of, patchwork, textured
-from scipy.ndimage import map_coordinates
+from oracles import bilinear, draw_uniform, fragments_of, linear_of, patchwork, square, textured
 
 from renderer.camera import OrthographicCamera
 from renderer.mesh import Mesh
 from renderer.settings import ENCODINGS, ImageSettings
 from renderer.surface.albedo import face_albedo, paint_faces, surface_albedo, with_added_albedo
 from renderer.surface.gloss import sample_gloss
-from renderer.visibility import choose
-from renderer.visibility.fragments import Fragments, build_fragments
+from renderer.visibility.fragments import Fragments
 
 EPS = torch.finfo(torch.float64).eps
 # Camera whose image shows x to the right and y up, from -1 to 1.
 ABOVE = OrthographicCamera(0, -90.0, 2.0)
-# A square that fills this image, and its texture coordinates.
-SQUARE = [[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]
-SQUARE_FACES = [[0, 1, 2], [0, 2, 3]]
+# Texture coordinates of a square that fills this image.
 UNIT_UVS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
 
 def view(mesh: Mesh, size: int, samples: int = 1, camera: OrthographicCamera = ABOVE) -> Fragments:
-    settings = ImageSettings(size, samples)
-    [fragments] = build_fragments(mesh.vertices, mesh.faces, [camera], settings, choose("numpy"))
-    return fragments
+    return fragments_of(mesh, camera, ImageSettings(size, samples))
 
 
 def random_texture(height: int, width: int, seed: int = 0) -> np.ndarray:
@@ -37,8 +31,8 @@ def random_texture(height: int, width: int, seed: int = 0) -> np.ndarray:
 
 
 def poster(texture: np.ndarray, uvs=UNIT_UVS, color=(1.0, 1.0, 1.0)) -> Mesh:
-    square = Mesh.plain(SQUARE, SQUARE_FACES, color)
-    return textured(square, np.asarray(uvs)[SQUARE_FACES], texture)
+    mesh = square(1, color=color)
+    return textured(mesh, np.asarray(uvs)[mesh.faces], texture)
 
 
 def patchwork_sphere() -> Mesh:
@@ -61,14 +55,10 @@ def test_texture_lookup_is_scipys_linear_interpolation_of_linear_texels_and_repe
     fragments = view(mesh, 23)
     x, y = (fragments.positions().numpy().T + 1) / 2
     u, v = (uvs[0] + np.outer(x, uvs[1] - uvs[0]) + np.outer(y, uvs[3] - uvs[0])).T
-    # Row and column in units of texels, whose centers are whole numbers in SciPy.
-    position = np.stack([(1 - v) * height - 0.5, u * width - 0.5])
-    channels = np.moveaxis(decoded(texture / 255, encoding), 2, 0)
-    expected = []
-    for channel in channels:
-        expected.append(map_coordinates(channel, position, order=1, mode="grid-wrap"))
+    texels = decoded(texture / 255, encoding)
+    expected = bilinear(texels, (1 - v) * height - 0.5, u * width - 0.5)
     albedo = surface_albedo(mesh, fragments, encoding)
-    np.testing.assert_allclose(albedo, np.stack(expected, axis=1), atol=64 * EPS)
+    np.testing.assert_allclose(albedo, expected, atol=64 * EPS)
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)

@@ -14,8 +14,22 @@ import numpy as np
 import pytest
 import torch
 from numpy.polynomial import legendre
-from oracles import Lobe, coat_albedo, directions_of, draw, draw_uniform, image_of, textured, toward
+from oracles import (
+    Lobe,
+    coat_albedo,
+    directions_of,
+    draw,
+    draw_uniform,
+    fragments_of,
+    image_of,
+    operator_of,
+    relative_error,
+    square,
+    textured,
+    toward,
+)
 from scipy import optimize
+from scipy.special import roots_sh_legendre
 from torch import Tensor
 
 from renderer.camera import Camera, OrthographicCamera, orbit_cameras
@@ -29,15 +43,12 @@ from renderer.mesh import Mesh, concatenate, normalize, subdivide
 from renderer.microfacets import reflectance
 from renderer.mitsuba_scene import load, mitsuba, mitsuba_map, shape
 from renderer.operators.apply import TransferOperator
-from renderer.operators.build import build_operators
 from renderer.operators.rays import LocalLightView, Rays, Surface
 from renderer.rendering import precompute_transfer, render
 from renderer.settings import MIN_ROUGHNESS, ImageSettings
 from renderer.shaded_view import ShadedView
 from renderer.solids import solid, sphere
 from renderer.surface.gloss import Gloss, SampleGloss, smallest_roughness
-from renderer.visibility import choose
-from renderer.visibility.fragments import build_fragments
 
 [CAMERA] = orbit_cameras(1, 2.2)
 [NEARBY] = orbit_cameras(1, 2.2, fov=40.0)
@@ -57,12 +68,11 @@ def unit_vector(polar: float, azimuth: float = 0.0) -> np.ndarray:
 
 def hemisphere(rings: int) -> tuple[np.ndarray, np.ndarray]:
     """Return directions (N, 3) above z = 0 at `rings` nodes of z, and their solid angles (N,)."""
-    node, weight = legendre.leggauss(rings)
-    z = (node[:, None] + 1) / 2
+    z, weight = roots_sh_legendre(rings)
     azimuth_count = 2 * rings
     azimuth = 2 * np.pi * (np.arange(azimuth_count) + 0.5) / azimuth_count
-    solid_angles = np.repeat(weight / 2 * 2 * np.pi / azimuth_count, azimuth_count)
-    return directions_of(z, azimuth), solid_angles
+    solid_angles = np.repeat(weight * 2 * np.pi / azimuth_count, azimuth_count)
+    return directions_of(z[:, None], azimuth), solid_angles
 
 
 COSINES = [1e-3, 0.02, 0.07, 0.2, 0.37, 0.6, 0.9, 0.99, 1 - 1e-5]
@@ -74,14 +84,13 @@ def quadrature_of_narrow_lobes(degree: int) -> Iterator[tuple[np.ndarray, Tensor
     The nodes are closest together near the horizon and towards +x. The harmonics (N, K) of order
     m < 0 are odd in y and count as 0.
     """
-    node, weight = legendre.leggauss(240)
-    around, step = legendre.leggauss(120)
-    fraction = (around + 1) / 2
+    node, weight = roots_sh_legendre(240)
+    fraction, step = roots_sh_legendre(120)
     azimuth = math.pi * fraction**2
     order = torch.arange((degree + 1) ** 2) - bands(degree) * (bands(degree) + 1)
-    for root, ring in zip(np.split((node + 1) / 2, 24), np.split(weight, 24), strict=True):
+    for root, ring in zip(np.split(node, 24), np.split(weight, 24), strict=True):
         directions = directions_of(root[:, None] ** 2, azimuth)
-        solid_angles = (ring * root)[:, None] * 2 * math.pi * fraction * step
+        solid_angles = (ring * root)[:, None] * 8 * math.pi * fraction * step
         values = basis(torch.from_numpy(directions), degree)
         yield directions, values * torch.from_numpy(solid_angles).reshape(-1, 1) * (order >= 0)
 
@@ -240,10 +249,9 @@ class GraySurface:
         return 1 - self.specular_factor * coat_albedo(cosine, self.roughness)
 
     def mean_transmitted(self) -> float:
-        node, weight = legendre.leggauss(12)
-        cosines = (node + 1) / 2
+        cosines, weight = roots_sh_legendre(12)
         fractions = np.array([self.transmitted(cosine) for cosine in cosines])
-        return float(weight / 2 @ (2 * cosines * fractions))
+        return float(weight @ (2 * cosines * fractions))
 
     def reflectance(self, cosine: float, light: np.ndarray) -> np.ndarray:
         heights, ring_of_light = np.unique(light[:, 2], return_inverse=True)
@@ -255,15 +263,11 @@ class GraySurface:
 
 
 # A white floor that fills the image from every side above it.
-FLOOR = Mesh.plain(
-    [[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]], [[0, 1, 2], [0, 2, 3]], np.ones(3)
-)
+FLOOR = square(9)
 
 
-def operators_of(mesh, cameras, settings, light_basis, gloss) -> list[TransferOperator]:
-    return build_operators(
-        mesh, cameras, settings, choose("numpy"), basis=light_basis, dtype=DOUBLE, gloss=gloss
-    )
+def double_operator(mesh, camera, settings, light_basis, gloss) -> TransferOperator:
+    return operator_of(mesh, camera, settings, basis=light_basis, dtype=DOUBLE, gloss=gloss)
 
 
 @dataclass(frozen=True)
@@ -278,7 +282,7 @@ class FloorView:
         self, light: LocalBasis, coefficient: float, gloss: Gloss, floor: Mesh
     ) -> float:
         camera = OrthographicCamera(math.degrees(self.seen), 0.0, 1e-3)
-        [operator] = operators_of(floor, [camera], ImageSettings(1, 1), light, gloss)
+        operator = double_operator(floor, camera, ImageSettings(1, 1), light, gloss)
         coefficients = UP.new_full((light.size, 3), coefficient)
         return float(operator.radiance(coefficients)[0, 0]) / math.cos(self.lit)
 
@@ -313,15 +317,16 @@ class FloorUnderSky:
     ZONAL = tuple(l * (l + 1) for l in range(7))
 
     def __init__(self, gloss: Gloss) -> None:
-        node, weight = legendre.leggauss(24)
-        cosines = torch.from_numpy((node + 1) / 2)
+        cosines, weight = map(torch.from_numpy, roots_sh_legendre(24))
         polar_angles = [math.degrees(math.acos(cosine)) for cosine in cosines]
-        cameras = [OrthographicCamera(polar, 17.2, 1.0) for polar in polar_angles]
-        operators = operators_of(FLOOR, cameras, ImageSettings(1, 1), Harmonics(6), gloss)
-        rows = [operator.by_channel[0, self.ZONAL, 0] for operator in operators]
+        rows = []
+        for polar in polar_angles:
+            camera = OrthographicCamera(polar, 17.2, 1.0)
+            operator = double_operator(FLOOR, camera, ImageSettings(1, 1), Harmonics(6), gloss)
+            rows.append(operator.by_channel[0, self.ZONAL, 0])
         self.transfer = torch.stack(rows)
         # 2 cosine d(cosine) over [0, 1].
-        self.measure = torch.from_numpy(weight) * cosines
+        self.measure = 2 * weight * cosines
         directions = torch.stack([0 * cosines, (1 - cosines**2).sqrt(), cosines], dim=1)
         self.harmonics = basis(directions, 6)[:, self.ZONAL]
 
@@ -353,7 +358,7 @@ def test_the_part_of_the_sky_beside_a_wall_is_reflected_as_by_kulla_and_conty(po
     camera = OrthographicCamera(polar, 180.0, 1e-3)
     settings = ImageSettings(1, 8, shadows=True)
     gloss = Gloss(1.0, 0.0, specular_factor)
-    [operator] = operators_of(corner, [camera], settings, Harmonics(6), gloss)
+    operator = double_operator(corner, camera, settings, Harmonics(6), gloss)
     even_sky = load_light("uniform", 6).double() * math.pi
     found = float(operator.radiance(even_sky)[0, 0])
 
@@ -378,7 +383,6 @@ def positive_light(degree: int) -> Tensor:
 
 def mitsuba_radiance(mesh, light, surface, sample_count) -> Tensor:
     """Render a mesh with interpolated normals in an environment or by an emitter, (3, 16, 16)."""
-    pytest.importorskip("mitsuba")
     with mitsuba() as module:
         sampler = {"type": "multijitter", "sample_count": sample_count}
         sensor = sensor_of(CAMERA, 16) | {"sampler": sampler}
@@ -399,12 +403,8 @@ def mitsuba_radiance(mesh, light, surface, sample_count) -> Tensor:
 def our_radiance(mesh: Mesh, light: Tensor, gloss: Gloss, shadows: bool = False) -> Tensor:
     settings = ImageSettings(16, 8, normals="smooth", shadows=shadows)
     light_basis = Harmonics(math.isqrt(len(light)) - 1)
-    [operator] = operators_of(mesh, [CAMERA], settings, light_basis, gloss)
+    operator = double_operator(mesh, CAMERA, settings, light_basis, gloss)
     return image_of(operator, light)[:3]
-
-
-def relative_error(found: Tensor, expected: Tensor) -> float:
-    return float((found - expected).norm() / expected.norm())
 
 
 def rough_mirror(roughness: float) -> dict[str, Any]:
@@ -429,7 +429,7 @@ def test_the_highlight_of_a_lamp_is_mitsubas():
     coarse_ball = Mesh.plain(*sphere(2))
     lamp = Lamps(((2.0, 1.0, 2.5),), power=1.0)
     settings = ImageSettings(16, 4, normals="smooth")
-    [operator] = operators_of(coarse_ball, [CAMERA], settings, lamp, Gloss(0.4, metallic=1.0))
+    operator = double_operator(coarse_ball, CAMERA, settings, lamp, Gloss(0.4, metallic=1.0))
     found = image_of(operator, UP.new_ones(1, 3))[:3]
     intensity = {"type": "rgb", "value": [1.0] * 3}
     emitter = {"type": "point", "position": list(lamp.positions[0]), "intensity": intensity}
@@ -472,9 +472,7 @@ class GlossyView:
         self.mesh = normalize(solid("apple"))
         self.settings = ImageSettings(12, 2, normals=normals)
         self.rays = Rays(self.mesh)
-        [self.view] = build_fragments(
-            self.mesh.vertices, self.mesh.faces, [camera], self.settings, choose("numpy")
-        )
+        self.view = fragments_of(self.mesh, camera, self.settings)
         self.upstream = 0.3 + 0.5 * draw_uniform(3, len(self.view.pixels), seed=9)
 
     def start(self) -> dict[str, Tensor]:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import draw, patchwork, scipy_irradiance
+from oracles import draw, fragments_of, patchwork, scipy_irradiance
 from torch import Tensor
 
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
@@ -20,8 +20,7 @@ from renderer.settings import MAX_DEGREE, ImageSettings
 from renderer.surface import shading
 from renderer.surface.albedo import surface_albedo
 from renderer.surface.shading import radiance
-from renderer.visibility import choose
-from renderer.visibility.fragments import Fragments, build_fragments
+from renderer.visibility.fragments import Fragments
 
 EPS = torch.finfo(torch.float64).eps
 # Poles and directions on the equator, with both signs of zero.
@@ -109,11 +108,7 @@ class Scene:
 
     @cached_property
     def fragments(self) -> Fragments:
-        settings = ImageSettings(self.size, self.samples)
-        [fragments] = build_fragments(
-            self.mesh.vertices, self.mesh.faces, [self.camera], settings, choose("numpy")
-        )
-        return fragments
+        return fragments_of(self.mesh, self.camera, ImageSettings(self.size, self.samples))
 
     def vertices(self) -> Tensor:
         return torch.from_numpy(self.mesh.vertices.copy())

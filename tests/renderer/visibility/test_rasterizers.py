@@ -5,7 +5,6 @@ from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from ctypes.util import find_library
 from fractions import Fraction
-from importlib.util import find_spec
 from typing import NamedTuple
 
 import moderngl
@@ -19,10 +18,8 @@ from renderer.errors import InputError
 from renderer.visibility import SPAN, Rasterizer, choose, opengl
 from renderer.visibility.torch import rasterize
 
-HAS_NUMBA = find_spec("numba") is not None
-needs_numba = pytest.mark.skipif(not HAS_NUMBA, reason="numba is not installed")
 needs_egl = pytest.mark.skipif(find_library("EGL") is None, reason="no EGL library on this machine")
-ON_THE_CPU = ("numpy", "torch", "numba") if HAS_NUMBA else ("numpy", "torch")
+ON_THE_CPU = ("numpy", "torch", "numba")
 
 # Corners are rounded to this number of parts of a sample.
 PARTS = 256
@@ -31,11 +28,7 @@ FAR = 2**24 - 1
 NO_FACE = -1
 
 
-NUMBA = pytest.param("numba", marks=needs_numba)
-OPENGL = pytest.param("opengl", marks=needs_egl)
-
-
-@pytest.fixture(scope="module", params=["numpy", "torch", NUMBA, OPENGL])
+@pytest.fixture(scope="module", params=[*ON_THE_CPU, pytest.param("opengl", marks=needs_egl)])
 def rasterizer(request) -> Rasterizer:
     return choose(request.param)
 
@@ -218,7 +211,6 @@ def test_the_cpu_equals_the_reference_where_the_rounding_of_float64_decides():
         np.testing.assert_array_equal(ids, expected)
 
 
-@needs_numba
 @given(
     seed=st.integers(0, 2**32 - 1),
     view_count=st.integers(0, 3),

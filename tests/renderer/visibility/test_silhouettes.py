@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import draw_uniform, mesh_of, named_mesh
+from oracles import draw_uniform, mesh_of, named_mesh, relative_error, square
 from torch import Tensor
+from torch.autograd.functional import jacobian
 
 import renderer
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
@@ -56,12 +57,9 @@ def smooth_sums(image: Tensor) -> Tensor:
 
 
 def derivatives(image: ChangedImage, directions: Tensor, samples: int) -> Tensor:
-    change = torch.zeros_like(directions[0]).requires_grad_()
-    columns = []
-    for value in smooth_sums(image(change, samples)):
-        (gradient,) = torch.autograd.grad(value, change, retain_graph=True)
-        columns.append((directions * gradient).flatten(1).sum(1))
-    return torch.stack(columns, dim=1)
+    start = torch.zeros_like(directions[0])
+    gradients = jacobian(lambda change: smooth_sums(image(change, samples)), start)
+    return directions.flatten(1) @ gradients.flatten(1).T
 
 
 @torch.no_grad()
@@ -74,8 +72,11 @@ def differences(image: ChangedImage, directions: Tensor, samples: int, step: flo
     return torch.stack(rows)
 
 
-def relative_error(found: Tensor, expected: Tensor) -> float:
-    return float((found - expected).norm() / expected.norm())
+def require_differences(image, directions, samples, finer_samples, step, bound) -> None:
+    """Compare derivatives with differences of new images that have more samples."""
+    found = derivatives(image, directions, samples)
+    expected = differences(image, directions, finer_samples, step)
+    assert relative_error(found, expected) < bound
 
 
 def moved_vertices(mesh: renderer.Mesh, camera: Camera, size: int, normals: str) -> ChangedImage:
@@ -125,18 +126,14 @@ def test_gradients_by_vertices_are_differences_of_new_images(name, normals, came
     mesh = named_mesh(name)
     image = moved_vertices(mesh, camera, 64, normals)
     directions = displacements(torch.from_numpy(mesh.vertices))
-    found = derivatives(image, directions, samples=8)
-    expected = differences(image, directions, samples=20, step=0.02)
-    assert relative_error(found, expected) < BOUNDS.get(name, 0.02)
+    require_differences(image, directions, 8, 20, step=0.02, bound=BOUNDS.get(name, 0.02))
 
 
 def test_gradients_by_vertices_are_differences_of_new_images_of_a_few_pixels():
     mesh = named_mesh("mushroom")
     image = moved_vertices(mesh, NEAR, 32, "flat")
     directions = displacements(torch.from_numpy(mesh.vertices))[::3]
-    found = derivatives(image, directions, samples=8)
-    expected = differences(image, directions, samples=14, step=0.02)
-    assert relative_error(found, expected) < 0.02
+    require_differences(image, directions, 8, 14, step=0.02, bound=0.02)
 
 
 @pytest.mark.parametrize("camera", [FAR, TURNED], ids=["orthographic", "pinhole"])
@@ -147,20 +144,15 @@ def test_gradients_by_the_camera_are_differences_of_new_images(camera):
         names += ["principal_right", "principal_up", "pixel_aspect"]
     image = moved_camera(named_mesh("pear"), camera, names, 32)
     directions = torch.eye(len(names), dtype=torch.float64)
-    found = derivatives(image, directions, samples=8)
-    expected = differences(image, directions, samples=14, step=0.02)
-    assert relative_error(found, expected) < 0.02
+    require_differences(image, directions, 8, 14, step=0.02, bound=0.02)
 
 
 @pytest.mark.slow
 def test_gradients_by_the_camera_include_the_movement_of_highlights():
     metal = renderer.Gloss(0.5, 1.0)
     image = moved_camera(named_mesh("pear"), NEAR, ["polar", "azimuth"], 48, metal)
-    directions = torch.eye(2, dtype=torch.float64)
-    found = derivatives(image, directions, samples=8)
     # A smaller turn moves outlines across too few samples.
-    expected = differences(image, directions, samples=14, step=0.5)
-    assert relative_error(found, expected) < 0.1
+    require_differences(image, torch.eye(2, dtype=torch.float64), 8, 14, step=0.5, bound=0.1)
 
 
 def test_the_highlight_of_a_lamp_on_a_large_mirror_moves_with_the_camera():
@@ -168,36 +160,28 @@ def test_the_highlight_of_a_lamp_on_a_large_mirror_moves_with_the_camera():
     names = ["polar", "azimuth"]
     metal = renderer.Gloss(0.5, 1.0)
     camera = replace(NEAR, polar=20.0)
-    image = moved_camera(square(2.5, 0.0), camera, names, 16, metal, light=None, lights=lights)
-    directions = torch.eye(2, dtype=torch.float64)
-    found = derivatives(image, directions, samples=4)
-    expected = differences(image, directions, samples=4, step=0.1)
-    assert relative_error(found, expected) < 0.03
-
-
-def square(half: float, height: float) -> renderer.Mesh:
-    corners = [[half * x, half * y, height] for x, y in ((-1, -1), (1, -1), (1, 1), (-1, 1))]
-    return renderer.Mesh.plain(corners, [[0, 1, 2], [0, 2, 3]])
+    image = moved_camera(square(2.5), camera, names, 16, metal, light=None, lights=lights)
+    require_differences(image, torch.eye(2, dtype=torch.float64), 4, 4, step=0.1, bound=0.03)
 
 
 def pyramid_on_the_ground() -> list[renderer.Mesh]:
     """Create a pyramid, and ground that hides its base by rounding and has the radiance 0.12."""
-    base = square(0.5, 0.0).vertices - np.array([0, 0, 1e-12])
+    base = square(0.5).vertices - np.array([0, 0, 1e-12])
     sides = [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]
-    ground = square(0.9, 0.0)
-    gray_ground = renderer.Mesh.plain(ground.vertices, ground.faces, (0.2, 0.2, 0.2))
+    gray_ground = square(0.9, color=(0.2, 0.2, 0.2))
     return [renderer.Mesh.plain([*base, [0, 0, 0.5]], sides), gray_ground]
 
 
+ABOVE, BELOW = (0, 0, 0.5), (0, 0, -0.5)
 GROWING = {
-    "before the background": ([square(0.5, 0.0)], 0.5),
-    "hiding a square": ([square(0.5, 0.5), square(0.3, 0.0)], 0.5),
-    "before an equal square": ([square(0.5, 0.5), square(0.9, 0.0)], 0.0),
+    "before the background": ([square(0.5)], 0.5),
+    "hiding a square": ([square(0.5, ABOVE), square(0.3)], 0.5),
+    "before an equal square": ([square(0.5, ABOVE), square(0.9)], 0.0),
     "before a square that ends less than a sample further": (
-        [square(0.5, 0.5), square(0.503, 0.0)],
+        [square(0.5, ABOVE), square(0.503)],
         0.0,
     ),
-    "hidden": ([square(0.5, -0.5), square(0.9, 0.0)], 0.0),
+    "hidden": ([square(0.5, BELOW), square(0.9)], 0.0),
     "a pyramid on the ground": (pyramid_on_the_ground(), 0.6 - 0.12),
 }
 
@@ -233,14 +217,6 @@ def colored_plane(cells: int) -> tuple[renderer.Mesh, Tensor]:
     return renderer.Mesh.plain(points.numpy(), faces.numpy()), albedo
 
 
-def triangle_areas(points: Tensor, faces: Tensor) -> Tensor:
-    a, b, c = points[faces, :2].unbind(1)
-    first_edge = b - a
-    second_edge = c - a
-    cross_product = first_edge[:, 0] * second_edge[:, 1] - first_edge[:, 1] * second_edge[:, 0]
-    return cross_product / 2
-
-
 @pytest.mark.parametrize(
     ("size", "bounds"),
     [
@@ -254,7 +230,8 @@ def test_gradients_by_single_vertices_converge_to_those_of_areas_as_samples_grow
     """In even light, the sum of an image is that of the triangles' colors times their areas."""
     mesh, albedo = colored_plane(9)
     vertices = torch.from_numpy(mesh.vertices).requires_grad_()
-    areas = triangle_areas(vertices, torch.from_numpy(mesh.faces))
+    corners = vertices[torch.from_numpy(mesh.faces), :2]
+    areas = torch.linalg.det(corners[:, 1:] - corners[:, :1]) / 2
     pixels_per_area = (size / FROM_ABOVE.width) ** 2
     # The background has a radiance of 0.3 in three channels.
     total = ((albedo.sum(1) - 3 * 0.3) * areas).sum() * pixels_per_area
@@ -268,7 +245,7 @@ def test_gradients_by_single_vertices_converge_to_those_of_areas_as_samples_grow
 
 def test_a_growing_square_in_shadow_gains_its_perimeter_times_its_dark_radiance():
     """High walls around the square, outside of the image, hide most of the sky."""
-    floor = square(0.5, 0.0)
+    floor = square(0.5)
     rim = 3.0 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     low = np.column_stack([rim, np.full(4, -1.0)])
     high = np.column_stack([rim, np.full(4, 9.0)])

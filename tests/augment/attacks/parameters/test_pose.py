@@ -29,12 +29,6 @@ def problem_of(scene: Scene, **units) -> SceneProblem:
     return SceneProblem(scene, [Pose(scene, settings)])
 
 
-def costs(result, classifier, values) -> torch.Tensor:
-    rows = torch.zeros(len(values), dtype=torch.int64)
-    logits = classifier(result.problem.render(values, rows)[:, 0])
-    return logits.log_softmax(1)[:, result.criterion.source[0, 0]]
-
-
 @pytest.mark.parametrize("ground", [None, GRAY])
 def test_values_are_a_rotation_vector_a_shift_and_a_scale(ground):
     """An object on the ground stays on it."""
@@ -90,13 +84,10 @@ def test_gradients_by_the_pose_are_differences_of_new_images(ground):
     y, x = torch.meshgrid(ramp, ramp, indexing="ij")
     weights = torch.stack([torch.ones_like(x), torch.sin(2 * x + y), torch.cos(3 * y - x)])
 
-    values = problem.start.clone().requires_grad_()
-    image = problem.render(values, FIRST)[0, 0].sum(0)
-    gradients = []
-    for weight in weights:
-        (gradient,) = torch.autograd.grad((weight * image).sum(), values, retain_graph=True)
-        gradients.append(gradient[0])
-    found = torch.stack(gradients)
+    def sums(values: torch.Tensor) -> torch.Tensor:
+        return torch.einsum("kyx,yx->k", weights, problem.render(values, FIRST)[0, 0].sum(0))
+
+    found = torch.autograd.functional.jacobian(sums, problem.start)[:, 0]
 
     slopes = []
     for step in 0.2 * torch.eye(9, dtype=torch.float64)[:, None]:
@@ -121,7 +112,9 @@ def test_descent_finds_a_view_as_good_as_those_of_a_grid_and_at_random(result, b
     grid[:, 6:8] = torch.cartesian_prod(steps, steps)
     draws = [torch.Generator().manual_seed(seed) for seed in range(10)]
     others = torch.cat([grid, *map(result.problem.sample, draws)])
-    lowest = float(costs(result, by_color, others).min())
+    rows = torch.zeros(len(others), dtype=torch.int64)
+    logits = by_color(result.problem.render(others, rows)[:, 0])
+    lowest = float(logits.log_softmax(1)[:, result.criterion.source[0, 0]].min())
     before = float(result.minimum.cost_before[0])
     reached = float(result.minimum.cost[0])
     assert 0 < 0.95 * (before - lowest) < before - reached
