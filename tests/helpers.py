@@ -44,6 +44,12 @@ def save_noise(path: Path, rng: np.random.Generator, shape=(20, 24), low=0, high
     Image.fromarray(rng.integers(low, high, (*shape, 3)).astype(np.uint8)).save(path)
 
 
+def save_plain(path: Path, color: int | str | tuple[int, int, int], size=(8, 8)) -> None:
+    """Save an image of one color or 8-bit gray level, and create its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", size, (color,) * 3 if isinstance(color, int) else color).save(path)
+
+
 def save_colored_noise(path: Path, rng: np.random.Generator, contrast: int) -> None:
     """Save a data set of 60 training and 30 test images of three classes."""
     arrays = {"classes": np.array(FRUIT)}

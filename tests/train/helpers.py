@@ -1,5 +1,5 @@
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Iterable, Sequence
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import torch
@@ -7,7 +7,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from train.checkpoints import save
 from train.cli import Command, read_settings
+from train.data.photo import Photograph
 from train.networks import WideResNet, describe
+from train.results.predictions import Predictions
+from train.results.scoring import rank_classes
 from train.run_folder import BEST
 
 FIG_LIME_ORANGE = ["fig", "lime", "orange"]
@@ -37,6 +40,20 @@ def save_untrained_network(folder: Path, size: int) -> None:
     architecture = describe(network, FIG_LIME_ORANGE, size=size, encoding="linear", **shape)
     folder.mkdir()
     save(folder / BEST, {"model": network.state_dict(), "architecture": architecture})
+
+
+def ranked(
+    labels: Iterable[str],
+    logits: Any,
+    classes: Sequence[str],
+    positives: Sequence[str] = ("orange",),
+) -> Predictions:
+    """Rank the classes of images that show objects with some labels."""
+    shown = [
+        Photograph(PurePosixPath(f"{label}/{number}.png"), str(label), None)
+        for number, label in enumerate(labels)
+    ]
+    return rank_classes(shown, torch.as_tensor(logits), classes, positives)
 
 
 def read_markdown(text: str) -> dict[str, list[list[str]]]:
