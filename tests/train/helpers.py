@@ -1,16 +1,22 @@
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
+from itertools import zip_longest
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from train.auditing import lights
 from train.checkpoints import save
 from train.cli import Command, read_settings
 from train.data.photo import Photograph
 from train.networks import WideResNet, describe
+from train.results.compare import Evaluation
+from train.results.metrics import Pooled
 from train.results.predictions import Predictions
 from train.results.scoring import rank_classes
+from train.results.store import RunSummary
 from train.run_folder import BEST
 
 FIG_LIME_ORANGE = ["fig", "lime", "orange"]
@@ -43,17 +49,33 @@ def save_untrained_network(folder: Path, size: int) -> None:
 
 
 def ranked(
-    labels: Iterable[str],
+    labels: Sequence[str],
     logits: Any,
     classes: Sequence[str],
     positives: Sequence[str] = ("orange",),
+    sources: Sequence[str | None] = (),
+    meshes: Sequence[str | None] = (),
 ) -> Predictions:
     """Rank the classes of images that show objects with some labels."""
+    facts = zip_longest(labels, sources, meshes)
     shown = [
-        Photograph(PurePosixPath(f"{label}/{number}.png"), str(label), None)
-        for number, label in enumerate(labels)
+        Photograph(PurePosixPath(f"{label}/{number:03}.png"), str(label), source, mesh=mesh)
+        for number, (label, source, mesh) in enumerate(facts)
     ]
-    return rank_classes(shown, torch.as_tensor(logits), classes, positives)
+    return rank_classes(shown, torch.as_tensor(logits).double(), classes, positives)
+
+
+def evaluation_of(predictions: Predictions) -> Evaluation:
+    """Evaluate predictions of a run that has no folder."""
+    return Evaluation(RunSummary(Path("run"), "network", {}, {}, None), Pooled(predictions))
+
+
+def attack_shortly(patch: pytest.MonkeyPatch, *kinds: str, steps=2, additional=2) -> None:
+    """Attack some kinds of light alone in an audit, in few steps."""
+    patch.setattr(lights, "STEPS", steps)
+    patch.setattr(lights, "ADDITIONAL_STEPS", additional)
+    for kind in lights.KINDS.keys() - {*kinds}:
+        patch.delitem(lights.KINDS, kind)
 
 
 def read_markdown(text: str) -> dict[str, list[list[str]]]:

@@ -1,12 +1,14 @@
 import json
+from itertools import product
 from pathlib import Path
 
 import pytest
 import torch
-from PIL import Image
 from torch import Tensor, nn
 
 import norm_balls as nb
+from tests.helpers import save_plain
+from tests.train.helpers import attack_shortly
 from train.auditing import lights
 from train.commands import audit as engine
 
@@ -29,20 +31,16 @@ class Brightness(nn.Module):
 @pytest.fixture
 def laboratory(tmp_path_factory) -> str:
     folder = tmp_path_factory.mktemp("laboratory")
-    for name in CLASSES:
-        (folder / name).mkdir()
-        for shade in (60, 200):
-            Image.new("RGB", (SIZE, SIZE), (shade,) * 3).save(folder / name / f"{shade}.png")
+    for name, level in product(CLASSES, (60, 200)):
+        save_plain(folder / name / f"{level}.png", level)
     return str(folder)
 
 
 @pytest.fixture
 def options(monkeypatch, laboratory) -> dict:
-    steps = {"STEPS": 2, "ADDITIONAL_STEPS": 2}
-    for name, number in {**steps, "FRAME_COUNT": 2, "BALL_SIDE": 8, "SIDE": 8}.items():
+    attack_shortly(monkeypatch, "lighting")
+    for name, number in {"FRAME_COUNT": 2, "BALL_SIDE": 8, "SIDE": 8}.items():
         monkeypatch.setattr(lights, name, number)
-    for kind in ("skylight", "projector", "lamps"):
-        monkeypatch.delitem(lights.KINDS, kind)
     for name, count in {"VIEW_COUNT": 2, "ATTACKED_COUNT": 2, "RANDOM_LIGHT_COUNT": 1}.items():
         monkeypatch.setattr(engine, name, count)
     return {"classes": CLASSES, "size": SIZE, "laboratory": laboratory, "environments": ["grace"]}
