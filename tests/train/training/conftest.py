@@ -1,8 +1,30 @@
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from torchvision.models import get_model
+
+from tests.helpers import save_noise
+
+# Settings of trainings of the network `weights` in few steps.
+SMALL = [
+    *("network=torchvision:shufflenet_v2_x0_5", "size=32", "data.test_fraction=0.25"),
+    *("data.validation=0.25", "train.device=cpu", "train.precision=float32", "train.threads=1"),
+    "train.batch_size=8",
+]
+
+
+@pytest.fixture(scope="package")
+def photographs(tmp_path_factory) -> Path:
+    """Save photographs of two kinds of objects, of which every other one is bright."""
+    folder = tmp_path_factory.mktemp("photographs")
+    rng = np.random.default_rng(0)
+    for name in ("orange", "lemon"):
+        for number in range(16):
+            dark = 150 * (number % 2)
+            save_noise(folder / name / f"{number}.png", rng, (40, 36), dark, dark + 100)
+    return folder
 
 
 @pytest.fixture(scope="package")

@@ -1,15 +1,13 @@
 """experiment=photographs learns from unlabeled photographs in the light of a projector."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
 from augment.random_streams import generator
 from renderer.image import to_unit
-from tests.helpers import save_noise
 from tests.runs import completed_run
+from tests.train.training.conftest import SMALL
 from train.__main__ import main as train_command
 from train.checkpoints import load
 from train.commands import experiment
@@ -23,27 +21,12 @@ from train.training.augmentations import Augmentation, relit
 from train.training.averages import FACTORS, INTERPOLATION, interpolate, predict
 from train.training.recipe import TrainingLoss
 
-NAME = "shufflenet_v2_x0_5"
-SIZE = 32
 GRAY = Split(torch.full((64, 3, 24, 24), 180, dtype=torch.uint8), torch.zeros(64).long())
 
 
 @pytest.fixture(scope="module")
-def photographs(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("photographs")
-    rng = np.random.default_rng(0)
-    for number in range(24):
-        dark = 150 * (number % 2)
-        save_noise(folder / f"{number}.png", rng, (40, 36), dark, dark + 100)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def small(weights, photographs) -> list[str]:
-    files = [f"network=torchvision:{NAME}", f"weights={weights}", f"unlabeled={photographs}"]
-    data = [f"size={SIZE}", "data.test_fraction=0.25", "data.validation=0.25"]
-    hardware = ["train.device=cpu", "train.precision=float32", "train.threads=1"]
-    return [*files, *data, *hardware, "train.batch_size=8"]
+    return [*SMALL, f"weights={weights}", f"unlabeled={photographs}"]
 
 
 @pytest.fixture(scope="module")
