@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from scipy.stats import ttest_1samp
 
 from benchmarks import (
     common,
@@ -133,8 +134,6 @@ def test_optimizers_are_compared_at_equal_forward_passes(capsys, monkeypatch):
 
 
 def test_the_intervals_of_relit_photographs_are_those_of_scipy():
-    from scipy.stats import ttest_1samp
-
     draws = torch.Generator().manual_seed(1)
     column, first = torch.randint(0, 2, (2, 60), generator=draws).double()
     text = relit_photographs.cell(column[None], first[None], None)
@@ -147,8 +146,6 @@ def test_the_intervals_of_relit_photographs_are_those_of_scipy():
 
 
 def test_the_intervals_of_relit_photographs_contain_the_variation_between_seeds():
-    from scipy.stats import ttest_1samp
-
     means = 0.5 + torch.linspace(0, 0.1, 12, dtype=torch.float64) ** 2
     first = torch.linspace(0.499, 0.501, 20, dtype=torch.float64)[None]
     found = relit_photographs.interval(means[:, None] + first - 0.5, first)

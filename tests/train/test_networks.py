@@ -197,10 +197,12 @@ def test_an_impossible_architecture_is_refused_by_its_argument(argument, value):
         WideResNet(10, **{argument: value})
 
 
-@pytest.mark.parametrize("file", ["", BEST, PUBLISHED], ids=["folder", "checkpoint", "published"])
-def test_a_run_is_a_classifier_of_its_own_classes_at_its_own_size(network, tmp_path, file):
+@pytest.mark.parametrize(
+    ("prefix", "file"), [("", ""), ("run:", ""), ("run:", BEST), ("run:", PUBLISHED)]
+)
+def test_a_run_is_a_classifier_of_its_own_classes_at_its_own_size(network, tmp_path, prefix, file):
     write(tmp_path, network)
-    classifier = load_network(f"run:{tmp_path / file}")
+    classifier = load_network(f"{prefix}{tmp_path / file}")
     assert classifier.classes == CLASSES
     assert classifier.size == 48
     assert classifier.name == f"run:{tmp_path / file}"
@@ -208,11 +210,6 @@ def test_a_run_is_a_classifier_of_its_own_classes_at_its_own_size(network, tmp_p
     # A published network has half precision.
     tolerance = 0.01 if file == PUBLISHED else 0
     torch.testing.assert_close(classifier(images), network(images), rtol=tolerance, atol=tolerance)
-
-
-def test_the_folder_of_a_run_is_its_network(network, tmp_path):
-    write(tmp_path, network)
-    assert load_network(str(tmp_path)).name == f"run:{tmp_path}"
 
 
 @pytest.mark.parametrize(

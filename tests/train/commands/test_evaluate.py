@@ -1,12 +1,11 @@
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 from torch import Tensor, nn
 
 import norm_balls as nb
+from tests.helpers import save_plain
 
 SIZE = 8
 CLASSES = ["dark", "bright", "green"]
@@ -18,10 +17,8 @@ SHADES = {"dark": [10, 20, 200, 30], "bright": [250, 40, 220]}
 def photographs(tmp_path) -> Path:
     folder = tmp_path / "photographs"
     for name, shades in SHADES.items():
-        (folder / name).mkdir(parents=True)
         for index, shade in enumerate(shades):
-            pixels = np.full((SIZE, SIZE, 3), shade, np.uint8)
-            Image.fromarray(pixels).save(folder / name / f"{index}.png")
+            save_plain(folder / name / f"{index}.png", shade)
     return folder
 
 

@@ -299,19 +299,12 @@ def test_pycocotools_and_torchvision_read_boxes_and_masks(groups, tmp_path):
             assert (target["masks"][order].bool().numpy() == mask).all()
 
 
-@pytest.mark.ecosystem
-@pytest.mark.filterwarnings("ignore")
-def test_an_attack_on_the_pose_renders_silhouettes():
-    """The gradient by the pose needs them, as the attack says otherwise."""
-    chosen = main.read(["out=out", "attack@augment.attack=[pose]"])
-    assert [*chosen.augment.attack.parameters] == ["pose"]
-    assert chosen.renderer.silhouettes and not main.read(["out=out"]).renderer.silhouettes
-
-
 def test_the_parts_of_the_command_line_replace_those_of_the_default():
     assert main.read(["out=out", "splits={train: 1}"]).splits == {"train": 1}
 
 
+@pytest.mark.ecosystem
+@pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("splits", [{"train": 2, "val": 1}, {"train": 1}])
 def test_ultralytics_reads_boxes_and_classes(groups, tmp_path, splits):
     pytest.importorskip("ultralytics")
