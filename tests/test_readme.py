@@ -19,6 +19,7 @@ import norm_balls
 import renderer
 from augment import lighting
 from renderer.image import to_bytes
+from tests.helpers import save_plain
 from train.command_settings import RenderSettings
 from train.commands.render import run as write_renders
 
@@ -86,8 +87,7 @@ def write_data_set(name: str) -> None:
 def test_torchvision_classifier_block_trains_on_relit_photographs(folder, monkeypatch):
     for index, name in enumerate(("orange", "cup") * 2):
         path = folder / "photographs" / "train" / name / f"{index}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        Image.new("RGB", (64, 48), (90, 60 * index, 30)).save(path)
+        save_plain(path, (90, 60 * index, 30), (64, 48))
     build = models.mobilenet_v3_small
     monkeypatch.setattr(models, "mobilenet_v3_small", lambda weights: build())
     names = run("In torchvision, for a classifier")
@@ -197,8 +197,7 @@ def test_photographs_block_publishes_a_network_with_its_threshold(folder):
     for name, color in (("orange", (230, 120, 40)), ("cup", (90, 90, 200))):
         for index in range(20):
             path = folder / "lab" / name / f"{index}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            Image.new("RGB", (32, 32), tuple(value - 3 * index for value in color)).save(path)
+            save_plain(path, tuple(value - 3 * index for value in color), (32, 32))
     run("Photographs", nb=norm_balls)
     (point,) = norm_balls.load_run("published/best").operating_points
     assert point.label == "orange"
@@ -249,11 +248,12 @@ def test_training_loop_block_trains_on_data_and_renders():
 @pytest.mark.filterwarnings("default")
 def test_lightning_block_trains_on_data_and_renders():
     lightning = pytest.importorskip("lightning")
+    network, before = linear_network()
 
     class Module(lightning.LightningModule):
         def __init__(self):
             super().__init__()
-            self.network = nn.Sequential(nn.Flatten(), nn.Linear(3 * 32**2, 100))
+            self.network = network
 
         def forward(self, images):
             return self.network(images)
@@ -264,11 +264,9 @@ def test_lightning_block_trains_on_data_and_renders():
         def configure_optimizers(self):
             return torch.optim.SGD(self.parameters(), lr=0.01)
 
-    module = Module()
-    before = module.network[1].weight.detach().clone()
-    names = run("PyTorch Lightning, and loggers", module=module, data=Photographs())
+    names = run("PyTorch Lightning, and loggers", module=Module(), data=Photographs())
     assert len(names["callback"].renders.current) == 10
-    assert not torch.equal(module.network[1].weight, before)
+    assert not torch.equal(network[1].weight, before)
 
 
 def test_data_set_block_shows_the_class_of_each_render(capsys):

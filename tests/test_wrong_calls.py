@@ -26,7 +26,7 @@ from renderer import InputError, harmonics, skylight
 from renderer.errors import describe
 from renderer.light.lamps import Lamps, Projector
 from tests.detectors import BrightBox
-from tests.helpers import bright_or_dark
+from tests.helpers import bright_or_dark, save_plain
 from tests.tetrahedron import (
     CAMERA,
     CLASSIFIER,
@@ -458,17 +458,12 @@ CALLS += [*SERVICES, *SCORES, *RELIGHTING]
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write a mesh, a text, a folder named like a mesh, and two photographs."""
-    from PIL import Image
-
     here = tmp_path_factory.mktemp("wrong_calls")
     renderer.export_mesh(MESH, here / "a.glb")
     (here / "file.txt").write_text("text")
     (here / "folder.glb").mkdir()
     for name in ("orange", "other"):
-        (here / "photos" / name).mkdir(parents=True)
-        Image.new("RGB", (20, 20), name.replace("other", "blue")).save(
-            here / "photos" / name / "0.png"
-        )
+        save_plain(here / "photos" / name / "0.png", name.replace("other", "blue"), (20, 20))
     return here
 
 

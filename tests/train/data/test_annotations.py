@@ -23,8 +23,7 @@ def _draw(path, size=(80, 40), box=BOX, orientation=1):
 
 
 def _bounds(pixels):
-    rows, columns = (np.flatnonzero((pixels > 200).any(axis)) for axis in (1, 0))
-    return [columns[0], rows[0], columns[-1] + 1, rows[-1] + 1]
+    return list(Image.fromarray(pixels > 200).getbbox())
 
 
 def _write_coco(file, names=("a.png",), size=(80, 40), box=BOX, **changes):
@@ -100,7 +99,7 @@ def test_boxes_fit_photographs_that_a_camera_has_turned(tmp_path, orientation, i
     if is_stored:
         _write_coco(tmp_path / "a.json")
     else:
-        _write_coco(tmp_path / "a.json", size=(width, height), box=[*map(int, _bounds(upright))])
+        _write_coco(tmp_path / "a.json", size=(width, height), box=_bounds(upright))
     (photograph,) = read_annotations(tmp_path).photographs
     fitted = fit(photograph, (height, width), LETTERBOX)
     assert fitted.boxes[0].tolist() == _bounds(fitted.pixels[0]) == _bounds(upright)
