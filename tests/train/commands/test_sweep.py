@@ -41,22 +41,11 @@ def no_report() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="module")
-def run_sweep(tiny_npz) -> Callable[..., int | None]:
+@pytest.fixture
+def run_sweep(call, tiny_npz) -> Callable[..., int]:
     """Return a function that trains by a sweep in this process, and returns the exit status."""
-
-    def run(folder: Path, *overrides: str) -> int | None:
-        arguments = [*SMALL, f"data.path={tiny_npz}", f"sweep={folder}", *overrides]
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(sys, "argv", ["train", "--multirun", *arguments])
-            patch.setattr("hydra._internal.hydra.Hydra.get_mode", lambda *_, **__: None)
-            try:
-                command.main()
-            except SystemExit as stop:
-                return stop.code
-        return 0
-
-    return run
+    words = "train", "--multirun", *SMALL, f"data.path={tiny_npz}"
+    return lambda folder, *overrides: call(*words, f"sweep={folder}", *overrides)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +63,7 @@ def folder_of(tiny_npz) -> Callable[..., Path]:
     return find
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def swept(run_sweep, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("sweeps") / "swept"
     assert run_sweep(folder, "seed=0,1") == 0
@@ -213,10 +202,7 @@ def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_o
         ("photos=null,missing", "photos: missing is not a folder"),
     ],
 )
-def test_a_wrong_setting_fails_before_any_run(
-    run_sweep, tmp_path, monkeypatch, capsys, override, start
-):
-    monkeypatch.chdir(tmp_path)
+def test_a_wrong_setting_fails_before_any_run(run_sweep, tmp_path, capsys, override, start):
     assert run_sweep(tmp_path / "sweep", override) == USER_ERROR
     printed = capsys.readouterr()
     assert printed.err.startswith(f"error: {start}")
