@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 from torchvision.models import resnet18
+from torchvision.transforms.functional import normalize
 
 from renderer.errors import InputError
 from train.checkpoints import load_network, load_run, load_selected, save, write_published
@@ -59,12 +60,6 @@ def description_of(network: nn.Module, **changes) -> dict:
 def initial_of(path: Path) -> Initial:
     source, state = load_selected(path)
     return Initial(source, state["architecture"], state["model"])
-
-
-def normalize(images: Tensor) -> Tensor:
-    mean = torch.tensor(MEAN).view(3, 1, 1)
-    std = torch.tensor(STD).view(3, 1, 1)
-    return (images - mean) / std
 
 
 def write(folder: Path, network: nn.Module, description: dict | None = None, **changes) -> Path:
@@ -127,7 +122,7 @@ def test_the_forward_pass_is_the_published_one():
             nn.init.uniform_(module.weight, 0.5, 2)
             nn.init.uniform_(module.bias, -1, 1)
     images = torch.rand(2, 3, 12, 12, dtype=torch.float64)
-    expected = published_logits(network.state_dict(), normalize(images))
+    expected = published_logits(network.state_dict(), normalize(images, MEAN, STD))
     torch.testing.assert_close(network(images), expected)
 
 
@@ -170,7 +165,7 @@ def test_a_torchvision_network_is_torchvisions_own_after_normalization():
     own = resnet18(num_classes=3)
     images = torch.rand(2, 3, 32, 32)
     # Another memory layout would round differently.
-    normalized = normalize(images).contiguous(memory_format=torch.channels_last)
+    normalized = normalize(images, MEAN, STD).contiguous(memory_format=torch.channels_last)
     assert torch.equal(built.eval()(images), own.eval()(normalized))
     assert all(parameter.requires_grad for parameter in built.parameters())
 

@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 from torchvision.models import get_model
+from torchvision.transforms.functional import normalize
 
 from augment.exposure import normalize_light
 from augment.settings import NormalizedLightSettings
@@ -48,11 +49,9 @@ def almost_fixed(tuned) -> tuple[Path, dict[str, float]]:
     return tuned("unlabeled", ALMOST_FIXED, "train.epochs=2")
 
 
-def normalized_logits(network, images, mean=IMAGENET_MEAN, std=IMAGENET_STD) -> Tensor:
-    mean_of_channel = torch.tensor(mean).view(3, 1, 1)
-    std_of_channel = torch.tensor(std).view(3, 1, 1)
+def normalized_logits(network, images) -> Tensor:
     with torch.no_grad():
-        return network.eval()((images - mean_of_channel) / std_of_channel)
+        return network.eval()(normalize(images, IMAGENET_MEAN, IMAGENET_STD))
 
 
 def load_torchvision(path: Path) -> nn.Module:
