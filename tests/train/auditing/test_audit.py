@@ -47,12 +47,16 @@ def views() -> lights.Views:
     return lights.Views([orange], 4, 0, torch.device("cpu"))
 
 
-def mean_values(views: lights.Views, power: float) -> torch.Tensor:
-    """Render the views with all lamps at a power, and average each image."""
-    scene = views.scene(8, "lamps")
-    ((rows, _),) = [part for part in scene.basis.lights if part[1].name == "lamps"]
-    light = scene.basis.project_nonnegative(scene.lights)
-    light[:, rows] = power
+def mean_values(views: lights.Views, power: float | None = None) -> torch.Tensor:
+    """Render the views in their light, or with all lamps at a power, and average each image."""
+    if power is None:
+        scene = views.scene(8)
+        light = (load_light(views.light) * views.exposure).expand(len(scene), -1, -1)
+    else:
+        scene = views.scene(8, "lamps")
+        ((rows, _),) = [part for part in scene.basis.lights if part[1].name == "lamps"]
+        light = scene.basis.project_nonnegative(scene.lights)
+        light[:, rows] = power
     images = scene.render(Conditions(light), torch.arange(len(scene)))
     return images.mean((1, 2, 3, 4))
 
@@ -82,20 +86,13 @@ def test_attacks_within_a_radius_succeed_where_the_brightest_lamps_do(views, tmp
         assert random <= hits
 
 
-def mean_values_of(views: lights.Views) -> torch.Tensor:
-    scene = views.scene(8)
-    light = load_light(views.light) * views.exposure
-    conditions = Conditions(light.expand(len(scene), -1, -1))
-    return scene.render(conditions, torch.arange(len(scene))).mean((1, 2, 3, 4))
-
-
 def test_views_are_attacked_at_an_exposure_at_which_they_are_recognized(views):
-    limit = float(mean_values_of(views).min()) - 1e-3
+    limit = float(mean_values(views).min()) - 1e-3
     plain = lights.find_plain_views(darker_than(limit), views)
     assert plain.recognized_as_given == 0
     assert plain.recognized >= 3
     found = replace(views, light=plain.light, exposure=plain.exposure, size=plain.size)
-    assert plain.recognized == int((mean_values_of(found) < limit).sum())
+    assert plain.recognized == int((mean_values(found) < limit).sum())
 
     plain = lights.find_plain_views(darker_than(1.0), views)
     assert plain.recognized == plain.recognized_as_given == views.count
