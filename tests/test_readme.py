@@ -12,7 +12,7 @@ import torch
 import trimesh
 from PIL import Image
 from torch import nn
-from torch.utils.data import Dataset
+from torch.utils.data import ConcatDataset
 from torchvision import models, tv_tensors
 
 import norm_balls
@@ -131,7 +131,7 @@ def test_ultralytics_block_trains_on_relit_images(folder, monkeypatch):
 def test_lightning_module_block_trains_on_relit_images(relit):
     pytest.importorskip("lightning")
     network, before = linear_network()
-    run("In a Lightning module", network=network, data=Photographs())
+    run("In a Lightning module", network=network, data=PHOTOGRAPHS)
     assert relit == [torch.Tensor]
     assert not torch.equal(network[1].weight, before)
 
@@ -222,21 +222,16 @@ def test_block_without_gradients_finds_an_adversary_with_few_queries():
     assert not result.backward_passes.any()
 
 
-class Photographs(Dataset):
-    """Eight gray images whose labels are numbers, as torchvision's are."""
-
-    def __len__(self) -> int:
-        return 8
-
-    def __getitem__(self, index: int) -> tuple[torch.Tensor, int]:
-        return torch.full((3, 32, 32), index / 8), index
+# Gray images whose labels are numbers, as torchvision's are, in a data set.
+GRAYS = [(torch.full((3, 32, 32), label / 8), label) for label in range(8)]
+PHOTOGRAPHS = ConcatDataset([GRAYS])
 
 
 def test_training_loop_block_trains_on_data_and_renders():
     torch.manual_seed(0)
     network, before = linear_network()
     optimizer = torch.optim.SGD(network.parameters(), lr=0.01)
-    given = {"torch": torch, "network": network, "data": Photographs(), "optimizer": optimizer}
+    given = {"torch": torch, "network": network, "data": PHOTOGRAPHS, "optimizer": optimizer}
     names = run("Your own training loop", **given)
     assert len(names["renders"]) == 10
     assert names["renders"].labels.eq(53).all()
@@ -264,7 +259,7 @@ def test_lightning_block_trains_on_data_and_renders():
         def configure_optimizers(self):
             return torch.optim.SGD(self.parameters(), lr=0.01)
 
-    names = run("PyTorch Lightning, and loggers", module=Module(), data=Photographs())
+    names = run("PyTorch Lightning, and loggers", module=Module(), data=PHOTOGRAPHS)
     assert len(names["callback"].renders.current) == 10
     assert not torch.equal(network[1].weight, before)
 
