@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
-from torch import Tensor
+from torch import Tensor, nn
 from torchvision.ops import masks_to_boxes
 
 from augment.classifier import Classifier
@@ -21,14 +21,23 @@ def bright_or_dark(images: Tensor) -> Tensor:
     return torch.stack([3 * mean, 0.4 + 0 * mean], dim=1)
 
 
-def darker_than(limit: float, size: int = 8, name: str = "", scale: float = 100) -> Classifier:
-    """Make a classifier that takes images darker than a limit on average for an orange."""
+class Brightness(nn.Module):
+    """Network that takes images darker than a limit on average for its first class."""
 
-    def logits(images: Tensor) -> Tensor:
-        excess = scale * (images.mean((1, 2, 3)) - limit)
+    def __init__(self, limit: float, scale: float = 100):
+        super().__init__()
+        self.limit = nn.Parameter(torch.tensor(float(limit)))
+        self.scale = scale
+
+    def forward(self, images: Tensor) -> Tensor:
+        excess = self.scale * (images.mean((1, 2, 3)) - self.limit)
         return torch.stack([-excess, excess], dim=1)
 
-    return Classifier(logits, size, ("orange", "other"), name or f"darker than {limit}")
+
+def darker_than(limit: float, size: int = 8, name: str = "", scale: float = 100) -> Classifier:
+    """Make a classifier that takes images darker than a limit on average for an orange."""
+    network = Brightness(limit, scale).eval()
+    return Classifier(network, size, ("orange", "other"), name or f"darker than {limit}")
 
 
 def colored_noise(labels: np.ndarray, rng: np.random.Generator, contrast: int) -> np.ndarray:

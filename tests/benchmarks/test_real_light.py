@@ -128,7 +128,7 @@ def test_a_run_is_loaded_as_network_spells_it():
     assert all(map(torch.equal, one.state_dict().values(), other.state_dict().values()))
 
 
-def test_crops_of_a_photograph_are_drawn_together(folder, monkeypatch):
+def test_crops_of_a_photograph_are_drawn_together(folder):
     found = real_light.find_photographs(folder, ["orange", "ball"], "orange")
     counts = real_light.Folder(folder, found, has_crops=True).draw("orange")
     names = [item.path.stem.partition("__")[2][:2] for item in found]

@@ -17,7 +17,7 @@ from train.results.metrics import Pooled
 from train.results.predictions import Predictions
 from train.results.scoring import rank_classes
 from train.results.store import RunSummary
-from train.run_folder import BEST
+from train.run_folder import BEST, LOCK
 
 FIG_LIME_ORANGE = ["fig", "lime", "orange"]
 
@@ -76,6 +76,11 @@ def attack_shortly(patch: pytest.MonkeyPatch, *kinds: str, steps=2, additional=2
     patch.setattr(lights, "ADDITIONAL_STEPS", additional)
     for kind in lights.KINDS.keys() - {*kinds}:
         patch.delitem(lights.KINDS, kind)
+
+
+def modification_times(folder: Path) -> dict[Path, int]:
+    """Return when each file and folder was written, except for locks."""
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.name != LOCK}
 
 
 def read_markdown(text: str) -> dict[str, list[list[str]]]:

@@ -4,28 +4,15 @@ from pathlib import Path
 
 import pytest
 import torch
-from torch import Tensor, nn
 
 import norm_balls as nb
-from tests.helpers import save_plain
+from tests.helpers import Brightness, save_plain
 from tests.train.helpers import attack_shortly
 from train.auditing import lights
 from train.commands import audit as engine
 
 SIZE = 8
 CLASSES = ["orange", "apple"]
-
-
-class Brightness(nn.Module):
-    """A network that calls an orange what is darker than a limit on average."""
-
-    def __init__(self):
-        super().__init__()
-        self.limit = nn.Parameter(torch.tensor(0.5))
-
-    def forward(self, images: Tensor) -> Tensor:
-        excess = 100 * (images.mean((1, 2, 3)) - self.limit)
-        return torch.stack([-excess, excess], dim=1)
 
 
 @pytest.fixture
@@ -48,7 +35,7 @@ def options(monkeypatch, laboratory) -> dict:
 
 @pytest.mark.slow
 def test_the_report_has_the_numbers_of_the_files(options, tmp_path):
-    network = Brightness().eval()
+    network = Brightness(0.5).eval()
     out = tmp_path / "audit"
     report = nb.audit(network, ["solid:orange:0"], out=out, **options)
     counts = json.loads((out / "classifier" / "lighting.json").read_text())
@@ -73,7 +60,7 @@ def test_a_mesh_in_memory_and_a_networks_file_are_audited_by_index(options, tmp_
     """The numbers are those of the mesh's file and of the network itself, by name."""
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    network = Brightness().eval()
+    network = Brightness(0.5).eval()
     nb.export_mesh(nb.solid("orange", 0), tmp_path / "orange.glb")
     mesh = nb.load_mesh(tmp_path / "orange.glb")
     expected = nb.audit(network, [tmp_path / "orange.glb"], **options)

@@ -13,7 +13,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.train.helpers import read_markdown
+from tests.train.helpers import modification_times, read_markdown
 from train import __main__ as command
 from train.__main__ import run_name
 from train.cli import USER_ERROR, expand
@@ -117,21 +117,12 @@ def test_file_systems_and_command_lines_take_the_name_of_a_run(values):
     assert override.value() == f"runs/sweep/{name}"
 
 
-def read_files(folders: list[Path]) -> dict[Path, tuple[bytes, int]]:
-    files = {}
-    for folder in folders:
-        for path in folder.rglob("*"):
-            if path.is_file() and path.name != LOCK:
-                files[path] = (path.read_bytes(), path.stat().st_mtime_ns)
-    return files
-
-
 @pytest.mark.slow
 def test_a_second_call_trains_nothing_and_shows_finished_runs(run_sweep, folder_of, swept, capsys):
     folders = [folder_of(swept, f"seed={seed}") for seed in (0, 1)]
-    before = read_files(folders)
+    before = [modification_times(folder) for folder in folders]
     assert run_sweep(swept, "seed=0,1") == 0
-    assert read_files(folders) == before
+    assert [modification_times(folder) for folder in folders] == before
     (table,) = read_markdown(capsys.readouterr().out).values()
     assert [row[:2] for row in table] == [["network", "runs"], ["none", "2"]]
 
