@@ -69,6 +69,12 @@ def finished(tiny, photos, tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.fixture
+def no_report(monkeypatch) -> None:
+    """Write no page of a training, whose plots take longer than the training."""
+    monkeypatch.setattr("train.commands.experiment.report_of", lambda folders, out: "no report")
+
+
 LOG = (
     '{"epoch": 1}\n{"epoch": 2}\n'
     '{"test/accuracy": 0.76543, "test/accuracy_last": 0.75, "test/epoch": 2}\n'

@@ -40,12 +40,6 @@ def two_methods(tiny_npz) -> list[str]:
     return ["data=npz", f"data.path={tiny_npz}", "compare=[none]"]
 
 
-@pytest.fixture
-def no_report(monkeypatch) -> None:
-    """Write no page of a training, whose plots take longer than the training."""
-    monkeypatch.setattr("train.commands.experiment.report_of", lambda folders, out: "no report")
-
-
 @pytest.mark.slow
 def test_two_methods_end_with_their_table_and_the_command(
     call, capsys, tmp_path, two_methods, photos

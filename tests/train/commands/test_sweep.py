@@ -3,7 +3,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -17,28 +17,19 @@ from tests.train.helpers import modification_times, read_markdown
 from train import __main__ as command
 from train.__main__ import run_name
 from train.cli import USER_ERROR, expand
-from train.commands import experiment
 from train.commands.experiment import format_sweep
 from train.run_config import write_config
 from train.run_folder import FAILURE, LAST, LOCK, locked, read_metrics
 from train.training import loop
 from train.training.run import Run
 
+pytestmark = pytest.mark.usefixtures("no_report")
 ROOT = Path(__file__).parents[3]
 SMALL = [
     *("experiment=paper", "augment=none", "data=npz", "model.depth=10", "model.width=1"),
     *("train.epochs=2", "train.batch_size=16", "train.learning_rate=0.05"),
     *("train.precision=float32", "train.device=cpu", "photos=null"),
 ]
-
-
-@pytest.fixture(autouse=True, scope="module")
-def no_report() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            experiment, "report_of", lambda folders, out: f"report: {len(folders)} in {out}"
-        )
-        yield
 
 
 @pytest.fixture
