@@ -67,13 +67,8 @@ def test_time_against_error_of_the_renderer(tmp_path, monkeypatch):
     assert len(again) == len(rows)
 
 
-@pytest.fixture
-def view() -> scene.View:
-    """Return a view of an ellipsoid of 162 vertices in 8 × 8 pixels."""
-    return scene.View(scene.ellipsoid(2), 8, choose("numpy"))
-
-
-def test_the_benchmarks_reference_is_what_more_samples_converge_to(view):
+def test_the_benchmarks_reference_is_what_more_samples_converge_to():
+    view = scene.View(scene.ellipsoid(2), 8, choose("numpy"))
     # Even random samples would reduce the error to a quarter, with four times as many of
     # them per side.
     converged = scene.Converged(view)

@@ -12,13 +12,9 @@ from tests.helpers import darker_than, save_plain
 
 def rows_in(path):
     with path.open(newline="") as file:
-        return {tuple(row[:3]): [float(cell or "nan") for cell in row[3:6]] for row in rows(file)}
-
-
-def rows(file):
-    reader = csv.reader(file)
-    assert next(reader) == networks.HEADER
-    return reader
+        header, *rows = csv.reader(file)
+    assert header == networks.HEADER
+    return {tuple(row[:3]): [float(cell or "nan") for cell in row[3:6]] for row in rows}
 
 
 @pytest.fixture

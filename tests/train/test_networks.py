@@ -57,11 +57,6 @@ def description_of(network: nn.Module, **changes) -> dict:
     return describe(network, CLASSES, **shape)
 
 
-def initial_of(path: Path) -> Initial:
-    source, state = load_selected(path)
-    return Initial(source, state["architecture"], state["model"])
-
-
 def write(folder: Path, network: nn.Module, description: dict | None = None, **changes) -> Path:
     architecture = description_of(network) if description is None else description
     state = {"model": network.state_dict(), "architecture": architecture | changes}
@@ -250,7 +245,8 @@ def test_a_description_of_other_weights_is_refused_in_one_sentence(network, tmp_
 
 
 def test_an_initial_network_that_contradicts_the_run_is_refused(network, tmp_path):
-    initial = initial_of(write(tmp_path, network))
+    source, state = load_selected(write(tmp_path, network))
+    initial = Initial(source, state["architecture"], state["model"])
     other_classes = {"classes": ["pear", "apple", "orange"]}
     with pytest.raises(InputError, match=f"network={initial.source} .* classes"):
         initial.copy_to(network, description_of(network) | other_classes)

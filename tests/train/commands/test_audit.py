@@ -16,21 +16,17 @@ CLASSES = ["orange", "apple"]
 
 
 @pytest.fixture
-def laboratory(tmp_path_factory) -> str:
-    folder = tmp_path_factory.mktemp("laboratory")
+def options(monkeypatch, tmp_path_factory) -> dict:
+    laboratory = tmp_path_factory.mktemp("laboratory")
     for name, level in product(CLASSES, (60, 200)):
-        save_plain(folder / name / f"{level}.png", level)
-    return str(folder)
-
-
-@pytest.fixture
-def options(monkeypatch, laboratory) -> dict:
+        save_plain(laboratory / name / f"{level}.png", level)
     attack_shortly(monkeypatch, "lighting")
     for name, number in {"FRAME_COUNT": 2, "BALL_SIDE": 8, "SIDE": 8}.items():
         monkeypatch.setattr(lights, name, number)
     for name, count in {"VIEW_COUNT": 2, "ATTACKED_COUNT": 2, "RANDOM_LIGHT_COUNT": 1}.items():
         monkeypatch.setattr(engine, name, count)
-    return {"classes": CLASSES, "size": SIZE, "laboratory": laboratory, "environments": ["grace"]}
+    given = {"classes": CLASSES, "size": SIZE, "laboratory": str(laboratory)}
+    return given | {"environments": ["grace"]}
 
 
 @pytest.mark.slow

@@ -60,11 +60,6 @@ def details(folder: Path, index: int) -> dict:
     return json.loads((folder / "details" / f"{index:06d}.json").read_text())
 
 
-def decoded(counts: list[int], size: list[int]) -> np.ndarray:
-    values = np.repeat(np.arange(len(counts)) % 2, counts)
-    return values.reshape(size[::-1]).T.astype(bool)
-
-
 def test_parts_without_a_render_of_a_class_number_the_classes_alike(meshes, tmp_path):
     out = write(meshes, tmp_path / "out", count=3, maps=[])
     parts = [ImageFolder(str(out / part), allow_empty=True) for part in ("train", "val")]
@@ -89,8 +84,9 @@ def test_boxes_and_run_lengths_of_coco_are_those_of_the_mask(meshes, tmp_path):
         assert item["image_id"] == image["id"]
         assert (folder / "val" / image["file_name"]).exists()
         mask = np.array(Image.open(folder / "details" / f"{image['id'] - 1:06d}_mask.png"))
-        segmentation = item["segmentation"]
-        assert (decoded(segmentation["counts"], segmentation["size"]) == (mask == 1)).all()
+        counts, size = (item["segmentation"][key] for key in ("counts", "size"))
+        decoded = np.repeat(np.arange(len(counts)) % 2, counts).reshape(size[::-1]).T
+        assert (decoded == (mask == 1)).all()
         left, top, width, height = item["bbox"]
         box = left, top, left + width, top + height
         assert box == Image.fromarray(mask).getbbox()

@@ -29,24 +29,11 @@ def small(weights, photographs) -> list[str]:
     return [*SMALL, f"weights={weights}", f"unlabeled={photographs}"]
 
 
-@pytest.fixture(scope="module")
-def settings_of(small):
-    def read(folder, *overrides):
-        words = ["experiment=photographs", "train.epochs=2", "train.learning_rate=0.003"]
-        return train_command.read([*words, *small, f"out={folder}", *overrides])
-
-    return read
-
-
-@pytest.fixture(scope="module")
-def finished(settings_of, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("runs") / "run"
-    return folder, completed_run(settings_of(folder), folder)
-
-
 @pytest.mark.slow
-def test_the_weights_lie_on_the_line_between_original_and_trained_ones(finished, weights):
-    folder, scores = finished
+def test_the_weights_lie_on_the_line_between_original_and_trained_ones(small, weights, tmp_path):
+    words = ["experiment=photographs", "train.epochs=2", "train.learning_rate=0.003", *small]
+    folder = tmp_path / "run"
+    scores = completed_run(train_command.read([*words, f"out={folder}"]), folder)
     best = load(folder / BEST)
     factor = best[INTERPOLATION]
     assert factor in FACTORS
