@@ -13,7 +13,6 @@ from train.run_config import write_config
 from train.run_folder import locked
 
 HOSTILE = "<script>alert(1)</script>|*x*"
-COMMAND = "python -m train experiment=best"
 
 
 def rows_of(page: Path) -> list[list[str]]:
@@ -55,7 +54,7 @@ def write_attack(folder: Path) -> None:
 def page(finished, made_up_run, tiny, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("all")
     shutil.copytree(finished, folder / "finished")
-    write_config(folder / "finished", tiny(), command=COMMAND)
+    write_config(folder / "finished", tiny())
     for seed in (0, 1):
         made_up_run(folder / f"plain{seed}", "none", None, f"seed={seed}")
     made_up_run(folder / "old", "none", {"photographs": {"recall": {"value": 0.5}}})
