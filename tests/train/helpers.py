@@ -20,7 +20,12 @@ from train.results.store import RunSummary
 from train.run_folder import BEST, LOCK
 
 FIG_LIME_ORANGE = ["fig", "lime", "orange"]
-
+# Settings of trainings of a small network of torchvision in few steps.
+SHORT_TRAINING = [
+    *("network=torchvision:shufflenet_v2_x0_5", "size=32", "data.test_fraction=0.25"),
+    *("data.validation=0.25", "train.device=cpu", "train.precision=float32", "train.threads=1"),
+    "train.batch_size=8",
+]
 
 COMPOSED: dict[tuple[str, ...], DictConfig] = {}
 

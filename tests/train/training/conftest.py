@@ -7,13 +7,6 @@ from torchvision.models import get_model
 
 from tests.helpers import save_noise
 
-# Settings of trainings of the network `weights` in few steps.
-SMALL = [
-    *("network=torchvision:shufflenet_v2_x0_5", "size=32", "data.test_fraction=0.25"),
-    *("data.validation=0.25", "train.device=cpu", "train.precision=float32", "train.threads=1"),
-    "train.batch_size=8",
-]
-
 
 @pytest.fixture(scope="package")
 def photographs(tmp_path_factory) -> Path:

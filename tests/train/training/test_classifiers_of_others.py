@@ -14,7 +14,7 @@ from augment.settings import NormalizedLightSettings
 from augment.sources import load_classifier
 from renderer.errors import InputError
 from tests.runs import completed_run
-from tests.train.training.conftest import SMALL
+from tests.train.helpers import SHORT_TRAINING
 from train.__main__ import main as train_command
 from train.checkpoints import load_run
 from train.run_folder import read_metrics
@@ -23,7 +23,7 @@ from train.training.inputs import load_data
 NAME = "shufflenet_v2_x0_5"
 SIZE = 32
 SETTINGS = [
-    *("experiment=harden", "augment=none", *SMALL, "train.images_per_epoch=16"),
+    *("experiment=harden", "augment=none", *SHORT_TRAINING, "train.images_per_epoch=16"),
     *("train.learning_rate=0.001", "train.distillation_weight=1"),
 ]
 # Learning rate with which the weights hardly move.

@@ -7,7 +7,7 @@ from torch.distributions import Categorical, kl_divergence
 from augment.random_streams import generator
 from renderer.image import to_unit
 from tests.runs import completed_run
-from tests.train.training.conftest import SMALL
+from tests.train.helpers import SHORT_TRAINING
 from train.__main__ import main as train_command
 from train.checkpoints import load
 from train.commands import experiment
@@ -26,7 +26,7 @@ GRAY = Split(torch.full((64, 3, 24, 24), 180, dtype=torch.uint8), torch.zeros(64
 
 @pytest.fixture(scope="module")
 def small(weights, photographs) -> list[str]:
-    return [*SMALL, f"weights={weights}", f"unlabeled={photographs}"]
+    return [*SHORT_TRAINING, f"weights={weights}", f"unlabeled={photographs}"]
 
 
 @pytest.mark.slow

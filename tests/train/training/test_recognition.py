@@ -11,7 +11,7 @@ from augment.switch import LIT_NAME, Recognizer, statistics
 from renderer import InputError
 from renderer.image import to_unit
 from tests.runs import completed_run
-from tests.train.training.conftest import SMALL
+from tests.train.helpers import SHORT_TRAINING
 from train.__main__ import main as train_command
 from train.checkpoints import load_network
 from train.data.sets import Split
@@ -135,7 +135,7 @@ def test_layers_of_positions_and_of_windows_recognize_no_light(network):
 
 def test_a_run_gets_the_images_in_the_light_of_its_training(weights, photographs, tmp_path):
     name, run = "torchvision:shufflenet_v2_x0_5", tmp_path / "run"
-    words = [*SMALL, f"weights={weights}", f"unlabeled={photographs}", f"out={run}"]
+    words = [*SHORT_TRAINING, f"weights={weights}", f"unlabeled={photographs}", f"out={run}"]
     words += ["train.epochs=1", "train.learning_rate=0.003"]
     completed_run(train_command.read(["experiment=stripes", *words]), run)
     plain = load_network(name, weights, size=SIZE)
