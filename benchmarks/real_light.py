@@ -143,7 +143,9 @@ class Folder:
         """Object of each photograph, or its class if photos.csv does not name all objects of it."""
         named = [(item.label, item.mesh) for item in self.photographs]
         unnamed = {label for label, mesh in named if not mesh}
-        return np.array([label if label in unnamed else f"{label}: {mesh}" for label, mesh in named])
+        return np.array(
+            [label if label in unnamed else f"{label}: {mesh}" for label, mesh in named]
+        )
 
     def has_objects(self, label: str) -> bool:
         """Return whether each light shows MIN_OBJECTS objects of a class, and of other classes.

@@ -5,12 +5,15 @@ from pathlib import Path
 import numpy as np
 import torch
 from PIL import Image
-from torch import Tensor
+from torch import Tensor, nn
+from torchvision.ops import masks_to_boxes
 
 from augment.classifier import Classifier
 from augment.scene.scene import Scene
 
 FRUIT = ["apple", "orange", "pear"]
+# From the last pixels of torchvision's boxes to their right and lower sides.
+BORDER = torch.tensor([0, 0, 1, 1])
 
 
 def bright_or_dark(images: Tensor) -> Tensor:
@@ -28,14 +31,23 @@ def by_channel(size: int, classes: tuple[str, ...] = CHANNELS, name: str = "") -
     return Classifier(lambda images: 30 * images.mean((2, 3))[:, channels], size, classes, name)
 
 
-def darker_than(limit: float, size: int = 8, name: str = "", scale: float = 100) -> Classifier:
-    """Make a classifier that takes images darker than a limit on average for an orange."""
+class Brightness(nn.Module):
+    """Network that takes images darker than a limit on average for its first class."""
 
-    def logits(images: Tensor) -> Tensor:
-        excess = scale * (images.mean((1, 2, 3)) - limit)
+    def __init__(self, limit: float, scale: float = 100):
+        super().__init__()
+        self.limit = nn.Parameter(torch.tensor(float(limit)))
+        self.scale = scale
+
+    def forward(self, images: Tensor) -> Tensor:
+        excess = self.scale * (images.mean((1, 2, 3)) - self.limit)
         return torch.stack([-excess, excess], dim=1)
 
-    return Classifier(logits, size, ("orange", "other"), name or f"darker than {limit}")
+
+def darker_than(limit: float, size: int = 8, name: str = "", scale: float = 100) -> Classifier:
+    """Make a classifier that takes images darker than a limit on average for an orange."""
+    network = Brightness(limit, scale).eval()
+    return Classifier(network, size, ("orange", "other"), name or f"darker than {limit}")
 
 
 def images_of(scene: Scene) -> Tensor:
@@ -60,6 +72,12 @@ def save_noise(path: Path, rng: np.random.Generator, shape=(20, 24), low=0, high
     Image.fromarray(rng.integers(low, high, (*shape, 3)).astype(np.uint8)).save(path)
 
 
+def save_plain(path: Path, color: int | str | tuple[int, int, int], size=(8, 8)) -> None:
+    """Save an image of one color or 8-bit gray level, and create its folder."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    Image.new("RGB", size, (color,) * 3 if isinstance(color, int) else color).save(path)
+
+
 def save_colored_noise(path: Path, rng: np.random.Generator, contrast: int) -> None:
     """Save a data set of 60 training and 30 test images of three classes."""
     arrays = {"classes": np.array(FRUIT)}
@@ -75,14 +93,12 @@ def find_red(images):
     outputs = []
     for image in images:
         is_object = ((image - 0.5).abs() > 0.05).any(0)
-        rows, columns = torch.nonzero(is_object, as_tuple=True)
-        if not len(rows):
+        if not is_object.any():
             empty = image.new_zeros(0)
             none = {"boxes": image.new_zeros(0, 4), "labels": empty.long(), "scores": empty}
             outputs.append(none)
             continue
-        sides = columns.min(), rows.min(), columns.max() + 1, rows.max() + 1
         red, green, _ = image[:, is_object].mean(1)
-        found = {"boxes": torch.stack(sides).float()[None], "labels": torch.tensor([0])}
+        found = {"boxes": masks_to_boxes(is_object[None]) + BORDER, "labels": torch.tensor([0])}
         outputs.append(found | {"scores": (12 * (red - green) - 1).sigmoid()[None]})
     return outputs

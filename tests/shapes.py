@@ -48,13 +48,9 @@ class _Finder(MetaPathFinder):
 def _wrap_members(owner: Any, module: str) -> None:
     for name, value in list(vars(owner).items()):
         if isinstance(value, (staticmethod, classmethod)):
-            wrapped = _checked(value.__func__)
-            if wrapped is not value.__func__:
-                setattr(owner, name, type(value)(wrapped))
+            setattr(owner, name, type(value)(_checked(value.__func__)))
         elif isinstance(value, types.FunctionType) and value.__module__ == module:
-            wrapped = _checked(value)
-            if wrapped is not value:
-                setattr(owner, name, wrapped)
+            setattr(owner, name, _checked(value))
         elif inspect.isclass(value) and value.__module__ == module and value is not owner:
             _wrap_members(value, module)
 

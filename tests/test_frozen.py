@@ -203,37 +203,34 @@ def listed(cameras: Any) -> list[renderer.Camera]:
     return [cameras] if isinstance(cameras, renderer.Camera) else cameras
 
 
-def render_arguments(case: RenderCase, folder: Path) -> dict[str, Tensor]:
-    """Make the light, the vertices and the albedo of a render in float32."""
+def rendered(
+    case: RenderCase, folder: Path, names: Iterable[str], dtype: torch.dtype, options: dict
+) -> list[Tensor]:
+    """Return images, and their gradients by the arguments with some names."""
     mesh = mesh_named(case.mesh, folder)
     shape = (mesh.textures or [mesh.faces])[0].shape
     draws = torch.Generator().manual_seed(2)
     albedo = 0.2 + 0.6 * torch.rand(shape, generator=draws)
     vertices = torch.from_numpy(mesh.vertices)
-    return {"light": light_named(case.light, folder), "vertices": vertices, "albedo": albedo}
+    given = {"light": light_named(case.light, folder), "vertices": vertices, "albedo": albedo}
+    leaves = {name: given[name].to(dtype).requires_grad_() for name in names}
+    options = {"light": given["light"]} | options | leaves
+    images = renderer.render(mesh, listed(case.cameras), size=SIZE, **options)
+    return [images, *gradients(images, list(leaves.values()))]
 
 
 @pytest.mark.parametrize("name", RENDERS)
 def test_render(name, tmp_path, verify):
     case = RENDERS[name]
-    arguments = render_arguments(case, tmp_path)
-    leaves = {key: arguments[key].float().requires_grad_() for key in case.differentiated}
-    options = {"light": arguments["light"], **SOFTWARE, **case.options, **leaves}
-    mesh = mesh_named(case.mesh, tmp_path)
-    images = renderer.render(mesh, listed(case.cameras), size=SIZE, **options)
-    verify(images, *gradients(images, list(leaves.values())))
+    options = SOFTWARE | case.options
+    verify(*rendered(case, tmp_path, case.differentiated, torch.float32, options))
 
 
 @pytest.mark.parametrize("name", sorted(RENDERS.keys() - TRACED))
 def test_values_of_a_render(name, tmp_path, verify_values):
     case = RENDERS[name]
-    arguments = render_arguments(case, tmp_path)
     names = dict.fromkeys(("light", *case.differentiated))
-    leaves = {key: arguments[key].double().requires_grad_() for key in names}
-    options = case.options | SOFTWARE | leaves
-    mesh = mesh_named(case.mesh, tmp_path)
-    images = renderer.render(mesh, listed(case.cameras), size=SIZE, **options)
-    verify_values(images, *gradients(images, list(leaves.values())))
+    verify_values(*rendered(case, tmp_path, names, torch.float64, case.options | SOFTWARE))
 
 
 def render_by_operators(name: str, lights: Tensor, folder: Path) -> list[Tensor]:

@@ -12,13 +12,14 @@ import torch
 import trimesh
 from PIL import Image
 from torch import nn
-from torch.utils.data import Dataset
+from torch.utils.data import ConcatDataset
 from torchvision import models, tv_tensors
 
 import norm_balls
 import renderer
 from augment import lighting
 from renderer.image import to_bytes
+from tests.helpers import save_plain
 from train.command_settings import RenderSettings
 from train.commands.render import run as write_renders
 
@@ -86,8 +87,7 @@ def write_data_set(name: str) -> None:
 def test_torchvision_classifier_block_trains_on_relit_photographs(folder, monkeypatch):
     for index, name in enumerate(("orange", "cup") * 2):
         path = folder / "photographs" / "train" / name / f"{index}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        Image.new("RGB", (64, 48), (90, 60 * index, 30)).save(path)
+        save_plain(path, (90, 60 * index, 30), (64, 48))
     build = models.mobilenet_v3_small
     monkeypatch.setattr(models, "mobilenet_v3_small", lambda weights: build())
     names = run("In torchvision, for a classifier")
@@ -131,7 +131,7 @@ def test_ultralytics_block_trains_on_relit_images(folder, monkeypatch):
 def test_lightning_module_block_trains_on_relit_images(relit):
     pytest.importorskip("lightning")
     network, before = linear_network()
-    run("In a Lightning module", network=network, data=Photographs())
+    run("In a Lightning module", network=network, data=PHOTOGRAPHS)
     assert relit == [torch.Tensor]
     assert not torch.equal(network[1].weight, before)
 
@@ -197,8 +197,7 @@ def test_photographs_block_publishes_a_network_with_its_threshold(folder):
     for name, color in (("orange", (230, 120, 40)), ("cup", (90, 90, 200))):
         for index in range(20):
             path = folder / "lab" / name / f"{index}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            Image.new("RGB", (32, 32), tuple(value - 3 * index for value in color)).save(path)
+            save_plain(path, tuple(value - 3 * index for value in color), (32, 32))
     run("Photographs", nb=norm_balls)
     (point,) = norm_balls.load_run("published/best").operating_points
     assert point.label == "orange"
@@ -223,21 +222,16 @@ def test_block_without_gradients_finds_an_adversary_with_few_queries():
     assert not result.backward_passes.any()
 
 
-class Photographs(Dataset):
-    """Eight gray images whose labels are numbers, as torchvision's are."""
-
-    def __len__(self) -> int:
-        return 8
-
-    def __getitem__(self, index: int) -> tuple[torch.Tensor, int]:
-        return torch.full((3, 32, 32), index / 8), index
+# Gray images whose labels are numbers, as torchvision's are, in a data set.
+GRAYS = [(torch.full((3, 32, 32), label / 8), label) for label in range(8)]
+PHOTOGRAPHS = ConcatDataset([GRAYS])
 
 
 def test_training_loop_block_trains_on_data_and_renders():
     torch.manual_seed(0)
     network, before = linear_network()
     optimizer = torch.optim.SGD(network.parameters(), lr=0.01)
-    given = {"torch": torch, "network": network, "data": Photographs(), "optimizer": optimizer}
+    given = {"torch": torch, "network": network, "data": PHOTOGRAPHS, "optimizer": optimizer}
     names = run("Your own training loop", **given)
     assert len(names["renders"]) == 10
     assert names["renders"].labels.eq(53).all()
@@ -249,11 +243,12 @@ def test_training_loop_block_trains_on_data_and_renders():
 @pytest.mark.filterwarnings("default")
 def test_lightning_block_trains_on_data_and_renders():
     lightning = pytest.importorskip("lightning")
+    network, before = linear_network()
 
     class Module(lightning.LightningModule):
         def __init__(self):
             super().__init__()
-            self.network = nn.Sequential(nn.Flatten(), nn.Linear(3 * 32**2, 100))
+            self.network = network
 
         def forward(self, images):
             return self.network(images)
@@ -264,11 +259,9 @@ def test_lightning_block_trains_on_data_and_renders():
         def configure_optimizers(self):
             return torch.optim.SGD(self.parameters(), lr=0.01)
 
-    module = Module()
-    before = module.network[1].weight.detach().clone()
-    names = run("PyTorch Lightning, and loggers", module=module, data=Photographs())
+    names = run("PyTorch Lightning, and loggers", module=Module(), data=PHOTOGRAPHS)
     assert len(names["callback"].renders.current) == 10
-    assert not torch.equal(module.network[1].weight, before)
+    assert not torch.equal(network[1].weight, before)
 
 
 def test_data_set_block_shows_the_class_of_each_render(capsys):

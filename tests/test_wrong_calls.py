@@ -26,7 +26,7 @@ from renderer import InputError, harmonics, skylight
 from renderer.errors import describe
 from renderer.light.lamps import Lamps, Projector
 from tests.detectors import BrightBox
-from tests.helpers import bright_or_dark
+from tests.helpers import bright_or_dark, save_plain
 from tests.tetrahedron import (
     CAMERA,
     CLASSIFIER,
@@ -82,11 +82,6 @@ def regenerated(model: Any) -> Any:
     return small_service().regenerate(model, 0)
 
 
-def operators(**changed: Any) -> list[renderer.TransferOperator]:
-    given: dict[str, Any] = {"mesh": MESH, "cameras": CAMERA, "size": SIZE, "samples": 1}
-    return renderer.precompute_transfer(**given | changed)
-
-
 def scene(meshes: Any = ((MESH, "orange"),), size: Any = SIZE, **changed: Any) -> augment.Scene:
     return augment.build_scene(meshes, size, **{"samples": 1, "light": "uniform", **changed})
 
@@ -95,17 +90,9 @@ def changed_scene(**changed: Any) -> augment.Scene:
     return small_scene().changed(**changed)
 
 
-def projected(**changed: Any) -> augment.Scene:
-    return scene(projector=augment.ProjectorSettings(**changed))
-
-
 def attack(classifier: Any = CLASSIFIER, **changed: Any) -> AttackResult:
     shown = changed.pop("scene") if "scene" in changed else small_scene()
     return augment.attack(classifier, shown, **changed)
-
-
-def mesh_of(**changed: Any) -> renderer.Mesh:
-    return replace(MESH, **changed)
 
 
 def rendered_with(**changed: Any) -> Tensor:
@@ -113,6 +100,8 @@ def rendered_with(**changed: Any) -> Tensor:
 
 
 plain_mesh = partial(renderer.Mesh.plain, MESH.vertices)
+mesh_of = partial(replace, MESH)
+operators = partial(renderer.precompute_transfer, mesh=MESH, cameras=CAMERA, size=SIZE, samples=1)
 
 
 def calls_of(
@@ -252,7 +241,13 @@ SCENES = [
         lambda x: scene([augment.ObjectSettings("solid:orange", "orange", color=x)]),
         [1.0, 0.0, 0.0],
     ),
-    *by_name(projected, pixels=[2.5, 0], pattern=[2.0, "missing.png"]),
+    *calls_of("pixels", lambda x: scene(projector=augment.ProjectorSettings(x)), 2.5, 0),
+    *calls_of(
+        "pattern",
+        lambda x: scene(projector=augment.ProjectorSettings(pattern=x)),
+        2.0,
+        "missing.png",
+    ),
     *calls_of("positions", lambda x: scene(lamps=augment.LampsSettings(x)), 3, [], [[1, 2]]),
     *calls_of("start", lambda x: scene(lamps=augment.LampsSettings(start=x)), [1, 2], None),
     *calls_of("mesh", lambda x: augment.ObjectSettings(x, "orange"), None, ""),
@@ -283,14 +278,6 @@ SCENES = [
 ]
 
 
-def transferred(**changed: Any) -> Any:
-    return augment.transfer(small_result(), **changed)
-
-
-def saved(**changed: Any) -> Any:
-    return augment.save(small_result(), "out", **changed)
-
-
 def animated(path: str = "attack.gif", **changed: Any) -> Any:
     return small_result().save_animation(path, **changed)
 
@@ -318,11 +305,13 @@ ATTACKS = [
     *calls_of("scales", lambda x: augment.success_by_radius(small_result(), x), 0.5, ["x"], [-1]),
     *calls_of("result", lambda x: augment.transfer(x, [CLASSIFIER]), None),
     *calls_of("classifiers", lambda x: augment.transfer(small_result(), x), ["squeezenet"], 3),
-    *by_name(transferred, azimuths=[30.0, ["x"], [NAN]], objects=[[MESH], MESH]),
+    *calls_of("azimuths", lambda x: augment.transfer(small_result(), azimuths=x), 30.0, ["x"]),
+    *calls_of("azimuths", lambda x: augment.transfer(small_result(), azimuths=x), [NAN]),
+    *calls_of("objects", lambda x: augment.transfer(small_result(), objects=x), [MESH], MESH),
     *calls_of("result", lambda x: augment.save(x, "out"), None),
     *calls_of("folder", lambda x: augment.save(small_result(), x), None, 3),
     *calls_of("file.txt", lambda x: augment.save(small_result(), x), "file.txt"),
-    *by_name(saved, verify=["blender", 3]),
+    *calls_of("verify", lambda x: augment.save(small_result(), "out", verify=x), "blender", 3),
     *by_name(animated, path=["attack.mp4"], frame_count=[1], example=[2], view=[2]),
     *calls_of("folder", augment.reload, None, 3),
     *calls_of("file.txt", augment.reload, "file.txt"),
@@ -458,17 +447,12 @@ CALLS += [*SERVICES, *SCORES, *RELIGHTING]
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write a mesh, a text, a folder named like a mesh, and two photographs."""
-    from PIL import Image
-
     here = tmp_path_factory.mktemp("wrong_calls")
     renderer.export_mesh(MESH, here / "a.glb")
     (here / "file.txt").write_text("text")
     (here / "folder.glb").mkdir()
     for name in ("orange", "other"):
-        (here / "photos" / name).mkdir(parents=True)
-        Image.new("RGB", (20, 20), name.replace("other", "blue")).save(
-            here / "photos" / name / "0.png"
-        )
+        save_plain(here / "photos" / name / "0.png", name.replace("other", "blue"), (20, 20))
     return here
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from scipy.stats import ttest_1samp
 
 from benchmarks import (
     common,
@@ -66,13 +67,8 @@ def test_time_against_error_of_the_renderer(tmp_path, monkeypatch):
     assert len(again) == len(rows)
 
 
-@pytest.fixture
-def view() -> scene.View:
-    """Return a view of an ellipsoid of 162 vertices in 8 × 8 pixels."""
-    return scene.View(scene.ellipsoid(2), 8, choose("numpy"))
-
-
-def test_the_benchmarks_reference_is_what_more_samples_converge_to(view):
+def test_the_benchmarks_reference_is_what_more_samples_converge_to():
+    view = scene.View(scene.ellipsoid(2), 8, choose("numpy"))
     # Even random samples would reduce the error to a quarter, with four times as many of
     # them per side.
     converged = scene.Converged(view)
@@ -133,8 +129,6 @@ def test_optimizers_are_compared_at_equal_forward_passes(capsys, monkeypatch):
 
 
 def test_the_intervals_of_relit_photographs_are_those_of_scipy():
-    from scipy.stats import ttest_1samp
-
     draws = torch.Generator().manual_seed(1)
     column, first = torch.randint(0, 2, (2, 60), generator=draws).double()
     text = relit_photographs.cell(column[None], first[None], None)
@@ -147,8 +141,6 @@ def test_the_intervals_of_relit_photographs_are_those_of_scipy():
 
 
 def test_the_intervals_of_relit_photographs_contain_the_variation_between_seeds():
-    from scipy.stats import ttest_1samp
-
     means = 0.5 + torch.linspace(0, 0.1, 12, dtype=torch.float64) ** 2
     first = torch.linspace(0.499, 0.501, 20, dtype=torch.float64)[None]
     found = relit_photographs.interval(means[:, None] + first - 0.5, first)

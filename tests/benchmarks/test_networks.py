@@ -4,22 +4,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from scipy.stats import rankdata
 
 from benchmarks import networks
-from tests.helpers import darker_than
+from tests.helpers import darker_than, save_plain
 
 
 def rows_in(path):
     with path.open(newline="") as file:
-        return {tuple(row[:3]): [float(cell or "nan") for cell in row[3:6]] for row in rows(file)}
-
-
-def rows(file):
-    reader = csv.reader(file)
-    assert next(reader) == networks.HEADER
-    return reader
+        header, *rows = csv.reader(file)
+    assert header == networks.HEADER
+    return {tuple(row[:3]): [float(cell or "nan") for cell in row[3:6]] for row in rows}
 
 
 @pytest.fixture
@@ -88,9 +83,7 @@ def real(tmp_path):
 
     def write(light, other):
         for label, level in (("orange", 40), (other, 200)):
-            path = tmp_path / f"real/projector/{label}/{light}__1.png"
-            path.parent.mkdir(parents=True)
-            Image.fromarray(np.full((8, 8, 3), level, np.uint8)).save(path)
+            save_plain(tmp_path / f"real/projector/{label}/{light}__1.png", level)
         return tmp_path / "real"
 
     return write

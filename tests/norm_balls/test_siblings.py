@@ -27,7 +27,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess:
+def run(folder: Path | None, *arguments: str) -> subprocess.CompletedProcess:
     command = [sys.executable, *arguments]
     return subprocess.run(command, cwd=folder, capture_output=True, text=True)
 
@@ -50,7 +50,6 @@ def test_a_foreign_module_that_was_imported_first_is_named(tmp_path, name):
 
 
 @pytest.mark.slow
-def test_packages_of_the_library_that_were_imported_before_stay(folder):
-    code = "import renderer, norm_balls as nb; assert nb.render is renderer.render"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+def test_packages_of_the_library_that_were_imported_before_stay():
+    done = run(None, "-c", "import renderer, norm_balls as nb; assert nb.render is renderer.render")
     assert done.returncode == 0, done.stderr

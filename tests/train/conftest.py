@@ -45,6 +45,16 @@ def photos(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
+def half_dark(tmp_path_factory) -> Path:
+    """Save twelve photographs near the limit of `bright_or_dark`, in two sub-folders."""
+    folder = tmp_path_factory.mktemp("half_dark")
+    rng = np.random.default_rng(0)
+    for index in range(12):
+        save_noise(folder / f"part_{index % 2}" / f"{index}.png", rng, high=2 * (20 + 2 * index))
+    return folder
+
+
+@pytest.fixture(scope="session")
 def tiny(tiny_npz) -> Callable[..., ExperimentSettings]:
     """Return a function that reads the real configuration with small sizes and other overrides."""
 
@@ -57,6 +67,12 @@ def finished(tiny, photos, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "finished"
     completed_run(tiny(f"photos={photos}"), folder)
     return folder
+
+
+@pytest.fixture
+def no_report(monkeypatch) -> None:
+    """Write no page of a training, whose plots take longer than the training."""
+    monkeypatch.setattr("train.commands.experiment.report_of", lambda folders, out: "no report")
 
 
 LOG = (

@@ -1,17 +1,31 @@
 from collections.abc import Sequence
-from pathlib import Path
+from itertools import zip_longest
+from pathlib import Path, PurePosixPath
 from typing import Any
 
+import pytest
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from train.auditing import lights
 from train.checkpoints import save
 from train.cli import Command, read_settings
+from train.data.photo import Photograph
 from train.networks import WideResNet, describe
-from train.run_folder import BEST
+from train.results.compare import Evaluation
+from train.results.metrics import Pooled
+from train.results.predictions import Predictions
+from train.results.scoring import rank_classes
+from train.results.store import RunSummary
+from train.run_folder import BEST, LOCK
 
 FIG_LIME_ORANGE = ["fig", "lime", "orange"]
-
+# Settings of trainings of a small network of torchvision in few steps.
+SHORT_TRAINING = [
+    *("network=torchvision:shufflenet_v2_x0_5", "size=32", "data.test_fraction=0.25"),
+    *("data.validation=0.25", "train.device=cpu", "train.precision=float32", "train.threads=1"),
+    "train.batch_size=8",
+]
 
 COMPOSED: dict[tuple[str, ...], DictConfig] = {}
 
@@ -37,6 +51,41 @@ def save_untrained_network(folder: Path, size: int) -> None:
     architecture = describe(network, FIG_LIME_ORANGE, size=size, encoding="linear", **shape)
     folder.mkdir()
     save(folder / BEST, {"model": network.state_dict(), "architecture": architecture})
+
+
+def ranked(
+    labels: Sequence[str],
+    logits: Any,
+    classes: Sequence[str],
+    positives: Sequence[str] = ("orange",),
+    sources: Sequence[str | None] = (),
+    meshes: Sequence[str | None] = (),
+) -> Predictions:
+    """Rank the classes of images that show objects with some labels."""
+    facts = zip_longest(labels, sources, meshes)
+    shown = [
+        Photograph(PurePosixPath(f"{label}/{number:03}.png"), str(label), source, mesh=mesh)
+        for number, (label, source, mesh) in enumerate(facts)
+    ]
+    return rank_classes(shown, torch.as_tensor(logits).double(), classes, positives)
+
+
+def evaluation_of(predictions: Predictions) -> Evaluation:
+    """Evaluate predictions of a run that has no folder."""
+    return Evaluation(RunSummary(Path("run"), "network", {}, {}, None), Pooled(predictions))
+
+
+def attack_shortly(patch: pytest.MonkeyPatch, *kinds: str, steps=2, additional=2) -> None:
+    """Attack some kinds of light alone in an audit, in few steps."""
+    patch.setattr(lights, "STEPS", steps)
+    patch.setattr(lights, "ADDITIONAL_STEPS", additional)
+    for kind in lights.KINDS.keys() - {*kinds}:
+        patch.delitem(lights.KINDS, kind)
+
+
+def modification_times(folder: Path) -> dict[Path, int]:
+    """Return when each file and folder was written, except for locks."""
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.name != LOCK}
 
 
 def read_markdown(text: str) -> dict[str, list[list[str]]]:

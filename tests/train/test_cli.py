@@ -40,12 +40,6 @@ def two_methods(tiny_npz) -> list[str]:
     return ["data=npz", f"data.path={tiny_npz}", "compare=[none]"]
 
 
-@pytest.fixture
-def no_report(monkeypatch) -> None:
-    """Write no page of a training, whose plots take longer than the training."""
-    monkeypatch.setattr("train.commands.experiment.report_of", lambda folders, out: "no report")
-
-
 @pytest.mark.slow
 def test_two_methods_end_with_their_table_and_the_command(
     call, capsys, tmp_path, two_methods, photos
@@ -187,6 +181,13 @@ def test_a_signal_and_a_full_disk_tell_how_to_resume_if_there_is_a_checkpoint(
     assert ("train.resume=true" in last_line) == has_trained
 
 
+def follow_advice(call, capsys, folder: Path) -> None:
+    """Run the command that the last printed line tells, which trains to the end."""
+    words = shlex.split(capsys.readouterr().out.splitlines()[-1])
+    assert call("train", *words[words.index("train") + 1 :]) == 0
+    assert (folder / LAST).is_file()
+
+
 def test_a_disk_full_before_the_first_checkpoint_tells_a_command_that_trains(
     call, capsys, no_report, tmp_path, tiny_npz
 ):
@@ -200,9 +201,7 @@ def test_a_disk_full_before_the_first_checkpoint_tells_a_command_that_trains(
         patch.setattr(checkpoints, "save", save_best_alone)
         data = "data=npz", f"data.path={tiny_npz}", "photos=null"
         assert call("train", "out=here", *data, *SMALL) == USER_ERROR
-    words = shlex.split(capsys.readouterr().out.splitlines()[-1])
-    assert call("train", *words[words.index("train") + 1 :]) == 0
-    assert (tmp_path / "here" / LAST).is_file()
+    follow_advice(call, capsys, tmp_path / "here")
 
 
 def test_a_signal_between_the_two_trainings_of_a_command_tells_one_that_goes_on(
@@ -221,9 +220,7 @@ def test_a_signal_between_the_two_trainings_of_a_command_tells_one_that_goes_on(
         patch.setattr("train.training.inputs.load_data", Mock(side_effect=KeyboardInterrupt))
         words = "out=here", "photographs_first=true", *data, *alone, *SMALL[1:]
         assert call("train", *words) == 128 + signal.SIGINT
-    words = shlex.split(capsys.readouterr().out.splitlines()[-1])
-    assert call("train", *words[words.index("train") + 1 :]) == 0
-    assert (tmp_path / "here" / LAST).is_file()
+    follow_advice(call, capsys, tmp_path / "here")
 
 
 def test_ctrl_c_is_one_line_even_if_a_library_turns_it_into_an_error(capsys):

@@ -11,12 +11,6 @@ CPU = torch.device("cpu")
 GPU = torch.device("cuda")
 
 
-@pytest.fixture
-def network() -> WideResNet:
-    torch.manual_seed(0)
-    return WideResNet(3, 10, 1, dropout=0.0).eval()
-
-
 def test_a_device_that_is_not_there_is_one_error():
     with pytest.raises(InputError, match=r"device=cuda:99 is not available here.*: use cpu"):
         device.choose_device("cuda:99")
@@ -60,7 +54,9 @@ def test_auto_is_bfloat16_where_hardware_computes_it(monkeypatch, where, machine
         assert device.choose_precision("auto", where, depthwise) == of_depthwise
 
 
-def test_bfloat16_rounds_inside_and_gives_float32_logits_and_gradients(network):
+def test_bfloat16_rounds_inside_and_gives_float32_logits_and_gradients():
+    torch.manual_seed(0)
+    network = WideResNet(3, 10, 1, dropout=0.0).eval()
     images = torch.rand(4, 3, 16, 16, requires_grad=True)
     exact = network(images)
     inside = []

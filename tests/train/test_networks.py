@@ -8,6 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 from torchvision.models import resnet18
+from torchvision.transforms.functional import normalize
 
 from renderer.errors import InputError
 from train.checkpoints import load_network, load_run, load_selected, save, write_published
@@ -54,17 +55,6 @@ def network() -> WideResNet:
 def description_of(network: nn.Module, **changes) -> dict:
     shape = {"size": 48, "encoding": "linear", "depth": 10, "width": 1, "dropout": 0.0} | changes
     return describe(network, CLASSES, **shape)
-
-
-def initial_of(path: Path) -> Initial:
-    source, state = load_selected(path)
-    return Initial(source, state["architecture"], state["model"])
-
-
-def normalize(images: Tensor) -> Tensor:
-    mean = torch.tensor(MEAN).view(3, 1, 1)
-    std = torch.tensor(STD).view(3, 1, 1)
-    return (images - mean) / std
 
 
 def write(folder: Path, network: nn.Module, description: dict | None = None, **changes) -> Path:
@@ -127,7 +117,7 @@ def test_the_forward_pass_is_the_published_one():
             nn.init.uniform_(module.weight, 0.5, 2)
             nn.init.uniform_(module.bias, -1, 1)
     images = torch.rand(2, 3, 12, 12, dtype=torch.float64)
-    expected = published_logits(network.state_dict(), normalize(images))
+    expected = published_logits(network.state_dict(), normalize(images, MEAN, STD))
     torch.testing.assert_close(network(images), expected)
 
 
@@ -170,7 +160,7 @@ def test_a_torchvision_network_is_torchvisions_own_after_normalization():
     own = resnet18(num_classes=3)
     images = torch.rand(2, 3, 32, 32)
     # Another memory layout would round differently.
-    normalized = normalize(images).contiguous(memory_format=torch.channels_last)
+    normalized = normalize(images, MEAN, STD).contiguous(memory_format=torch.channels_last)
     assert torch.equal(built.eval()(images), own.eval()(normalized))
     assert all(parameter.requires_grad for parameter in built.parameters())
 
@@ -197,10 +187,12 @@ def test_an_impossible_architecture_is_refused_by_its_argument(argument, value):
         WideResNet(10, **{argument: value})
 
 
-@pytest.mark.parametrize("file", ["", BEST, PUBLISHED], ids=["folder", "checkpoint", "published"])
-def test_a_run_is_a_classifier_of_its_own_classes_at_its_own_size(network, tmp_path, file):
+@pytest.mark.parametrize(
+    ("prefix", "file"), [("", ""), ("run:", ""), ("run:", BEST), ("run:", PUBLISHED)]
+)
+def test_a_run_is_a_classifier_of_its_own_classes_at_its_own_size(network, tmp_path, prefix, file):
     write(tmp_path, network)
-    classifier = load_network(f"run:{tmp_path / file}")
+    classifier = load_network(f"{prefix}{tmp_path / file}")
     assert classifier.classes == CLASSES
     assert classifier.size == 48
     assert classifier.name == f"run:{tmp_path / file}"
@@ -208,11 +200,6 @@ def test_a_run_is_a_classifier_of_its_own_classes_at_its_own_size(network, tmp_p
     # A published network has half precision.
     tolerance = 0.01 if file == PUBLISHED else 0
     torch.testing.assert_close(classifier(images), network(images), rtol=tolerance, atol=tolerance)
-
-
-def test_the_folder_of_a_run_is_its_network(network, tmp_path):
-    write(tmp_path, network)
-    assert load_network(str(tmp_path)).name == f"run:{tmp_path}"
 
 
 @pytest.mark.parametrize(
@@ -258,7 +245,8 @@ def test_a_description_of_other_weights_is_refused_in_one_sentence(network, tmp_
 
 
 def test_an_initial_network_that_contradicts_the_run_is_refused(network, tmp_path):
-    initial = initial_of(write(tmp_path, network))
+    source, state = load_selected(write(tmp_path, network))
+    initial = Initial(source, state["architecture"], state["model"])
     other_classes = {"classes": ["pear", "apple", "orange"]}
     with pytest.raises(InputError, match=f"network={initial.source} .* classes"):
         initial.copy_to(network, description_of(network) | other_classes)

@@ -36,13 +36,9 @@ def dependencies() -> list[Requirement]:
     return [Requirement(line) for line in project["dependencies"]]
 
 
-def oldest_versions() -> dict[str, str]:
-    lines = (ROOT / "tests" / "oldest.txt").read_text().splitlines()
-    return dict(line.split("==") for line in lines if not line.startswith("#"))
-
-
 def test_the_versions_that_are_tested_as_the_oldest_are_the_lower_bounds():
-    oldest = oldest_versions()
+    lines = (ROOT / "tests" / "oldest.txt").read_text().splitlines()
+    oldest = dict(line.split("==") for line in lines if not line.startswith("#"))
     assert oldest.keys() == {requirement.name for requirement in dependencies()}
     for requirement in dependencies():
         bounds = [bound.version for bound in requirement.specifier if bound.operator == ">="]

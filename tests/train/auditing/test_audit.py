@@ -16,9 +16,9 @@ from augment.scene import patterns
 from augment.scene.objects import Conditions, load_object
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
-from renderer.io.images import write_image
 from renderer.light.files import load_light
-from tests.helpers import darker_than
+from tests.helpers import darker_than, save_plain
+from tests.train.helpers import attack_shortly
 from train.auditing import lights
 from train.auditing.network import NEXT_HARDENING, NEXT_TRAINING, RECOGNIZED, AuditedNetwork
 from train.command_settings import AuditSettings
@@ -47,12 +47,16 @@ def views() -> lights.Views:
     return lights.Views([orange], 4, 0, torch.device("cpu"))
 
 
-def mean_values(views: lights.Views, power: float) -> torch.Tensor:
-    """Render the views with all lamps at a power, and average each image."""
-    scene = views.scene(8, "lamps")
-    ((rows, _),) = [part for part in scene.basis.lights if part[1].name == "lamps"]
-    light = scene.basis.project_nonnegative(scene.lights)
-    light[:, rows] = power
+def mean_values(views: lights.Views, power: float | None = None) -> torch.Tensor:
+    """Render the views in their light, or with all lamps at a power, and average each image."""
+    if power is None:
+        scene = views.scene(8)
+        light = (load_light(views.light) * views.exposure).expand(len(scene), -1, -1)
+    else:
+        scene = views.scene(8, "lamps")
+        ((rows, _),) = [part for part in scene.basis.lights if part[1].name == "lamps"]
+        light = scene.basis.project_nonnegative(scene.lights)
+        light[:, rows] = power
     images = scene.render(Conditions(light), torch.arange(len(scene)))
     return images.mean((1, 2, 3, 4))
 
@@ -82,20 +86,13 @@ def test_attacks_within_a_radius_succeed_where_the_brightest_lamps_do(views, tmp
         assert random <= hits
 
 
-def mean_values_of(views: lights.Views) -> torch.Tensor:
-    scene = views.scene(8)
-    light = load_light(views.light) * views.exposure
-    conditions = Conditions(light.expand(len(scene), -1, -1))
-    return scene.render(conditions, torch.arange(len(scene))).mean((1, 2, 3, 4))
-
-
 def test_views_are_attacked_at_an_exposure_at_which_they_are_recognized(views):
-    limit = float(mean_values_of(views).min()) - 1e-3
+    limit = float(mean_values(views).min()) - 1e-3
     plain = lights.find_plain_views(darker_than(limit), views)
     assert plain.recognized_as_given == 0
     assert plain.recognized >= 3
     found = replace(views, light=plain.light, exposure=plain.exposure, size=plain.size)
-    assert plain.recognized == int((mean_values_of(found) < limit).sum())
+    assert plain.recognized == int((mean_values(found) < limit).sum())
 
     plain = lights.find_plain_views(darker_than(1.0), views)
     assert plain.recognized == plain.recognized_as_given == views.count
@@ -104,10 +101,7 @@ def test_views_are_attacked_at_an_exposure_at_which_they_are_recognized(views):
 
 @pytest.fixture
 def lamps_alone(monkeypatch) -> None:
-    monkeypatch.setattr(lights, "STEPS", 3)
-    monkeypatch.setattr(lights, "ADDITIONAL_STEPS", 5)
-    for kind in ("skylight", "projector", "lighting"):
-        monkeypatch.delitem(lights.KINDS, kind)
+    attack_shortly(monkeypatch, "lamps", steps=3, additional=5)
     monkeypatch.setitem(lights.KINDS, "lamps", lights.KINDS["lamps"]._replace(radii=(10.0,)))
 
 
@@ -146,10 +140,7 @@ CLASSIFIERS = {"dark": darker_than(0.5), "guessing": guessing(), "large": darker
 
 @pytest.fixture
 def given(monkeypatch, tmp_path) -> dict[str, Any]:
-    monkeypatch.setattr(lights, "ADDITIONAL_STEPS", 2)
-    monkeypatch.setattr(lights, "STEPS", 2)
-    for kind in ("skylight", "projector", "lamps"):
-        monkeypatch.delitem(lights.KINDS, kind)
+    attack_shortly(monkeypatch, "lighting")
     monkeypatch.setattr(audit, "PATTERNS", ("solid", "rings"))
     counts = {"VIEW_COUNT": 2, "ATTACKED_COUNT": 2, "RANDOM_LIGHT_COUNT": 1}
     for name, count in {"SPP": 1, "SETUPS": 1, **counts}.items():
@@ -237,14 +228,21 @@ def test_an_audit_killed_as_it_removes_results_leaves_no_part_of_them(tmp_path, 
     assert [path.name for path in out.iterdir()] == ["config.yaml"]
 
 
-def test_an_audit_without_mitsuba_says_that_it_has_no_laboratory(given, tmp_path, monkeypatch):
+@pytest.fixture
+def no_success_without_mitsuba(monkeypatch) -> dict[str, Any]:
+    """Return the counts of each attack, of which none succeeds."""
     counts = {"n": 2, "correct": 2}
     for method in ("adversarial", "random"):
         counts |= {method: [0, 0, 0, 0], f"{method}_without_noise": [0, 0, 0, 0]}
-    recognized = {"uniform": [True], "random 1": [True]}
     monkeypatch.setattr(audit, "mitsuba", Mock(side_effect=InputError("Mitsuba is missing")))
-    monkeypatch.setattr(lights, "recognize_in_environments", lambda *_: recognized)
     monkeypatch.setattr(lights, "success_by_light", lambda *_: iter([counts, counts]))
+    return counts
+
+
+@pytest.mark.usefixtures("no_success_without_mitsuba")
+def test_an_audit_without_mitsuba_says_that_it_has_no_laboratory(given, tmp_path, monkeypatch):
+    recognized = {"uniform": [True], "random 1": [True]}
+    monkeypatch.setattr(lights, "recognize_in_environments", lambda *_: recognized)
     report = run_audit(AuditSettings(**given)).path
     assert "The laboratory is left out, and hard_negatives with it" in report.read_text()
     assert not (tmp_path / "audit/renders").exists()
@@ -253,17 +251,12 @@ def test_an_audit_without_mitsuba_says_that_it_has_no_laboratory(given, tmp_path
 
 @pytest.mark.parametrize("has_images", [False, True])
 def test_a_network_that_knows_no_view_is_to_be_trained_first(
-    given, tmp_path, monkeypatch, has_images
+    given, tmp_path, no_success_without_mitsuba, has_images
 ):
+    no_success_without_mitsuba["correct"] = 0
     for label in CLASSES if has_images else ():
-        (tmp_path / "renders" / label).mkdir(parents=True)
-        write_image(tmp_path / "renders" / label / "1.png", np.zeros((8, 8, 3), np.uint8))
+        save_plain(tmp_path / "renders" / label / "1.png", 0)
         given |= {"laboratory": str(tmp_path / "renders"), "hard_negatives": [], "label": "orange"}
-    counts = {"n": 2, "correct": 0}
-    for method in ("adversarial", "random"):
-        counts |= {method: [0, 0, 0, 0], f"{method}_without_noise": [0, 0, 0, 0]}
-    monkeypatch.setattr(audit, "mitsuba", Mock(side_effect=InputError("Mitsuba is missing")))
-    monkeypatch.setattr(lights, "success_by_light", lambda *_: iter([counts, counts]))
     audited = run_audit(AuditSettings(**given), {audit.CLASSIFIER: darker_than(-1)})
     assert (audited.recommendation is not None) == has_images
     assert audited.screen.sentences[-1] == NEXT_TRAINING
@@ -311,8 +304,7 @@ def test_lights_are_audited_whose_names_no_other_light_has(given, tmp_path, monk
     """No patterns are rendered with a given laboratory, and uniform light is there in any case."""
     monkeypatch.chdir(tmp_path)
     np.save("rings.npy", np.ones((8, 16, 3), np.float32))
-    Path("renders/orange").mkdir(parents=True)
-    write_image(Path("renders/orange/1.png"), np.zeros((8, 8, 3), np.uint8))
+    save_plain(Path("renders/orange/1.png"), 0)
     changes = {"environments": ["rings.npy"], "hard_negatives": [], "label": "orange", **rest}
     settings = AuditSettings(**given | changes)
     plan = audit._Plan(settings, {audit.CLASSIFIER: CLASSIFIERS["dark"]}, torch.device("cpu"))
@@ -333,14 +325,11 @@ def test_test_images_of_another_size_than_a_later_network_needs_are_refused(give
 def test_an_audit_of_meshes_ends_with_its_page_if_photographs_show_nothing(
     given, monkeypatch, tmp_path
 ):
-    def fail(*_: Any) -> None:
-        raise InputError("dark has no detections in 1 photographs: give others")
-
     found = []
     photographs = tmp_path / "photographs"
-    photographs.mkdir()
-    write_image(photographs / "gray.png", np.full((8, 8, 3), 128, np.uint8))
-    monkeypatch.setattr(audit, "_attack_photographs", fail)
+    save_plain(photographs / "gray.png", 128)
+    error = InputError("dark has no detections in 1 photographs: give others")
+    monkeypatch.setattr(audit, "_attack_photographs", Mock(side_effect=error))
     monkeypatch.setattr(audit._Plan, "measure", lambda *_: [])
     monkeypatch.setattr(audit.page, "write_audit_page", lambda *given: found.append(given[-1]))
     run_audit(AuditSettings(**given, unlabeled=str(photographs)))

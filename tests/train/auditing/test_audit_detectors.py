@@ -1,5 +1,5 @@
 import json
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,16 +21,21 @@ from train.commands.audit import run_audit
 SIZE = 32
 
 
-def test_recall_on_renders_is_the_part_of_views_in_which_the_object_is_found(monkeypatch, tmp_path):
+@pytest.fixture
+def no_attacks(monkeypatch) -> None:
     monkeypatch.setattr(engine, "KINDS", {})
+
+
+def views_of(name: str, count: int, **changes: Any) -> Views:
+    """Show a solid, by default as an orange."""
+    item = load_object(ObjectSettings(f"solid:{name}:0", label="orange"))
+    return Views([item], count, 0, torch.device("cpu"), **changes)
+
+
+@pytest.mark.usefixtures("no_attacks")
+def test_recall_on_renders_is_the_part_of_views_in_which_the_object_is_found(tmp_path):
     network = as_network(find_red, SIZE, ["orange", "apple"])
-    solids = {
-        name: load_object(ObjectSettings(f"solid:{name}:0", label=name))
-        for name in ("orange", "lemon")
-    }
-    views, negatives = (
-        Views([item], 3, 0, torch.device("cpu"), exposure=0.7) for item in solids.values()
-    )
+    views, negatives = (views_of(name, 3, exposure=0.7) for name in ("orange", "lemon"))
     lights = ["uniform", "eucalyptus"]
     unusual = engine.environment_lights(views, lights, 2)
     content = engine.find_in_lights(network, views, views, negatives, unusual, tmp_path)
@@ -52,24 +57,21 @@ def test_the_slider_shows_what_a_detector_predicts_at_its_threshold(monkeypatch)
     monkeypatch.setattr(engine, "FRAME_COUNT", 3)
     monkeypatch.setattr(engine, "STEPS", 5)
     network = as_network(find_red, 16, ["orange", "apple"], task=nb.Detection(threshold=0.9))
-    item = load_object(ObjectSettings("solid:orange:0", label="orange"))
-    views = Views([item], 1, 0, torch.device("cpu"), exposure=0.7)
-    frames = engine.frames_of(engine.adversaries(network, views, "lamps"), 0)["frames"]
+    result = engine.adversaries(network, views_of("orange", 1, exposure=0.7), "lamps")
+    frames = engine.frames_of(result, 0)["frames"]
     for frame in frames:
         assert frame["predicted"] == ("orange" if frame["probabilities"][0] >= 0.9 else "nothing")
     assert (frames[0]["predicted"], frames[-1]["predicted"]) == ("orange", "nothing")
 
 
-def test_metrics_of_a_detector_that_finds_nothing_are_zero_and_explained(monkeypatch, tmp_path):
-    monkeypatch.setattr(engine, "KINDS", {})
-
+@pytest.mark.usefixtures("no_attacks")
+def test_metrics_of_a_detector_that_finds_nothing_are_zero_and_explained(tmp_path):
     def find_nothing(images):
         empty = {"boxes": torch.zeros(0, 4), "labels": torch.zeros(0).long()}
         return [{**empty, "scores": torch.zeros(0)} for _ in images]
 
     network = as_network(find_nothing, SIZE, ["orange", "apple"], task=nb.Detection())
-    item = load_object(ObjectSettings("solid:orange:0", label="orange"))
-    views = Views([item], 2, 0, torch.device("cpu"))
+    views = views_of("orange", 2)
     unusual = engine.environment_lights(views, ["uniform"], 1)
     content = engine.find_in_lights(network, views, views, views, unusual, tmp_path)
     plain = content["metrics"]["plain light"]
@@ -111,17 +113,14 @@ def test_an_audit_of_a_detector_has_a_section_about_detections(tmp_path):
     assert report.network.attacks["lighting"].correct == 1
 
 
-def test_the_miou_on_renders_is_that_of_the_pixels_of_the_class(monkeypatch, tmp_path):
+@pytest.mark.usefixtures("no_attacks")
+def test_the_miou_on_renders_is_that_of_the_pixels_of_the_class(tmp_path):
     def find_gray(images):
         is_gray = (images - 0.5).abs().amax(1) < 0.05
         return torch.stack([is_gray.float(), 0.5 + 0 * images[:, 0]], dim=1)
 
-    monkeypatch.setattr(engine, "KINDS", {})
     network = as_network(find_gray, SIZE, ["background", "orange"])
-    items = [load_object(ObjectSettings(f"solid:{name}:0")) for name in ("orange", "lemon")]
-    views, negatives = (
-        Views([replace(item, label="orange")], 3, 0, torch.device("cpu")) for item in items
-    )
+    views, negatives = (views_of(name, 3) for name in ("orange", "lemon"))
     unusual = engine.environment_lights(views, ["uniform"], 1)
     content = engine.find_in_lights(network, views, views, negatives, unusual, tmp_path)
     scenes = [shown.scene(SIZE) for shown in (views, negatives)]

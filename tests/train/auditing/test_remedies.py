@@ -1,15 +1,14 @@
 import json
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path, PurePosixPath
 
 import numpy as np
 import pytest
 import torch
 
 import augment
-from renderer.io.images import write_image
-from tests.helpers import darker_than
+from tests.helpers import darker_than, save_plain
+from tests.train.helpers import evaluation_of, ranked
 from train.auditing import page
 from train.auditing.lights import KINDS, PlainViews
 from train.auditing.network import (
@@ -28,31 +27,20 @@ from train.auditing.network import (
 )
 from train.command_settings import AuditSettings
 from train.commands import audit
-from train.data.photo import Photograph
 from train.results.compare import Evaluation
-from train.results.metrics import Pooled
-from train.results.scoring import rank_classes
-from train.results.store import RunSummary
 
 COUNT = 60
 
 
 def evaluation(found: Sequence[int], labels: Sequence[str] = ("orange",)) -> Evaluation:
     """Score found images of COUNT of each label above all negatives, and other ones below."""
-    numbers = {name: range(COUNT) for name in (*labels, "other_ball")}
-    photographs = [
-        Photograph(PurePosixPath(f"{name}/{number}.png"), name, None)
-        for name, group in numbers.items()
-        for number in group
-    ]
+    shown = np.repeat([*labels, "other_ball"], COUNT)
     classes = ["other", *labels]
-    logits = torch.zeros(len(photographs), len(classes))
-    for row, photograph in enumerate(photographs):
-        if photograph.label in labels:
-            is_found = row % COUNT in found
-            logits[row, classes.index(photograph.label)] = 2 if is_found else -2
-    predictions = rank_classes(photographs, logits, classes, labels)
-    return Evaluation(RunSummary(Path("run"), "network", {}, {}, None), Pooled(predictions))
+    logits = torch.zeros(len(shown), len(classes))
+    for row, label in enumerate(shown):
+        if label in labels:
+            logits[row, classes.index(label)] = 2 if row % COUNT in found else -2
+    return evaluation_of(ranked(shown, logits, classes, labels))
 
 
 FEW = range(10)
@@ -84,9 +72,7 @@ def test_the_cheapest_best_remedy_is_recommended(light_alone, hardening, both, e
 
 
 def test_a_remedy_is_unknown_without_negatives():
-    positives = evaluation(FEW).pooled.all.positives
-    run = RunSummary(Path("run"), "network", {}, {}, None)
-    without = Evaluation(run, Pooled(positives))
+    without = evaluation_of(evaluation(FEW).pooled.all.positives)
     assert recommend({ORIGINAL: [without], LIGHT_ALONE: [without]}) is None
 
 
@@ -105,8 +91,7 @@ def test_a_network_that_normalizes_light_itself_gets_no_second_normalization():
 @pytest.mark.parametrize("shown", [(), ("orange",), ("orange", "other_apple")])
 def test_an_audit_of_a_hardened_network_warns_without_photographs_of_others(tmp_path, shown):
     for name in shown:
-        (tmp_path / name).mkdir()
-        write_image(tmp_path / name / "1.png", np.zeros((8, 8, 3), np.uint8))
+        save_plain(tmp_path / name / "1.png", 0)
     given = {audit.CLASSIFIER: darker_than(0.5), audit.HARDENED: darker_than(0.5)}
     photos = str(tmp_path) if shown else None
     settings = AuditSettings(network="x", label="orange", meshes=["solid:orange"], photos=photos)

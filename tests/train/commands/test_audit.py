@@ -1,12 +1,13 @@
 import json
+from itertools import product
 from pathlib import Path
 
 import pytest
 import torch
-from PIL import Image
-from torch import Tensor, nn
 
 import norm_balls as nb
+from tests.helpers import Brightness, save_plain
+from tests.train.helpers import attack_shortly
 from train.auditing import lights
 from train.commands import audit as engine
 
@@ -14,43 +15,23 @@ SIZE = 8
 CLASSES = ["orange", "apple"]
 
 
-class Brightness(nn.Module):
-    """A network that calls an orange what is darker than a limit on average."""
-
-    def __init__(self):
-        super().__init__()
-        self.limit = nn.Parameter(torch.tensor(0.5))
-
-    def forward(self, images: Tensor) -> Tensor:
-        excess = 100 * (images.mean((1, 2, 3)) - self.limit)
-        return torch.stack([-excess, excess], dim=1)
-
-
 @pytest.fixture
-def laboratory(tmp_path_factory) -> str:
-    folder = tmp_path_factory.mktemp("laboratory")
-    for name in CLASSES:
-        (folder / name).mkdir()
-        for shade in (60, 200):
-            Image.new("RGB", (SIZE, SIZE), (shade,) * 3).save(folder / name / f"{shade}.png")
-    return str(folder)
-
-
-@pytest.fixture
-def options(monkeypatch, laboratory) -> dict:
-    steps = {"STEPS": 2, "ADDITIONAL_STEPS": 2}
-    for name, number in {**steps, "FRAME_COUNT": 2, "BALL_SIDE": 8, "SIDE": 8}.items():
+def options(monkeypatch, tmp_path_factory) -> dict:
+    laboratory = tmp_path_factory.mktemp("laboratory")
+    for name, level in product(CLASSES, (60, 200)):
+        save_plain(laboratory / name / f"{level}.png", level)
+    attack_shortly(monkeypatch, "lighting")
+    for name, number in {"FRAME_COUNT": 2, "BALL_SIDE": 8, "SIDE": 8}.items():
         monkeypatch.setattr(lights, name, number)
-    for kind in ("skylight", "projector", "lamps"):
-        monkeypatch.delitem(lights.KINDS, kind)
     for name, count in {"VIEW_COUNT": 2, "ATTACKED_COUNT": 2, "RANDOM_LIGHT_COUNT": 1}.items():
         monkeypatch.setattr(engine, name, count)
-    return {"classes": CLASSES, "size": SIZE, "laboratory": laboratory, "environments": ["grace"]}
+    given = {"classes": CLASSES, "size": SIZE, "laboratory": str(laboratory)}
+    return given | {"environments": ["grace"]}
 
 
 @pytest.mark.slow
 def test_the_report_has_the_numbers_of_the_files(options, tmp_path):
-    network = Brightness().eval()
+    network = Brightness(0.5).eval()
     out = tmp_path / "audit"
     report = nb.audit(network, ["solid:orange:0"], out=out, **options)
     counts = json.loads((out / "classifier" / "lighting.json").read_text())
@@ -75,7 +56,7 @@ def test_a_mesh_in_memory_and_a_networks_file_are_audited_by_index(options, tmp_
     """The numbers are those of the mesh's file and of the network itself, by name."""
     (tmp_path / "here").mkdir()
     monkeypatch.chdir(tmp_path / "here")
-    network = Brightness().eval()
+    network = Brightness(0.5).eval()
     nb.export_mesh(nb.solid("orange", 0), tmp_path / "orange.glb")
     mesh = nb.load_mesh(tmp_path / "orange.glb")
     expected = nb.audit(network, [tmp_path / "orange.glb"], **options)

@@ -1,15 +1,13 @@
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
-from torch import Tensor, nn
 
 import norm_balls as nb
+from tests.helpers import Brightness, save_plain
 
 SIZE = 8
-CLASSES = ["dark", "bright", "green"]
+CLASSES = ["dark", "bright"]
 # Gray values of the photographs of each class.
 SHADES = {"dark": [10, 20, 200, 30], "bright": [250, 40, 220]}
 
@@ -18,28 +16,16 @@ SHADES = {"dark": [10, 20, 200, 30], "bright": [250, 40, 220]}
 def photographs(tmp_path) -> Path:
     folder = tmp_path / "photographs"
     for name, shades in SHADES.items():
-        (folder / name).mkdir(parents=True)
         for index, shade in enumerate(shades):
-            pixels = np.full((SIZE, SIZE, 3), shade, np.uint8)
-            Image.fromarray(pixels).save(folder / name / f"{index}.png")
+            save_plain(folder / name / f"{index}.png", shade)
     return folder
-
-
-class Brightness(nn.Module):
-    def __init__(self):
-        super().__init__()
-        self.weight = nn.Parameter(torch.ones(()))
-
-    def forward(self, images: Tensor) -> Tensor:
-        excess = self.weight * (images.mean((1, 2, 3)) - 127)
-        return torch.stack([-excess, excess, torch.full_like(excess, -1000)], dim=1)
 
 
 OPTIONS = {"classes": CLASSES, "size": SIZE, "value_range": (0, 255), "precision": "float32"}
 
 
 def test_scores_count_the_photographs_of_each_class(photographs):
-    scores = nb.evaluate(Brightness().eval(), photographs, by="class", **OPTIONS)
+    scores = nb.evaluate(Brightness(127, scale=1).eval(), photographs, by="class", **OPTIONS)
     assert (scores.by_class["dark"].recall.hits, scores.by_class["dark"].recall.n) == (3, 4)
     assert (scores.by_class["bright"].recall.hits, scores.by_class["bright"].recall.n) == (2, 3)
     assert (scores.overall.recall.hits, scores.overall.recall.n) == (5, 7)
@@ -51,7 +37,7 @@ def test_scores_count_the_photographs_of_each_class(photographs):
 
 
 def test_a_label_may_be_an_index(photographs):
-    scores = nb.evaluate(Brightness().eval(), photographs, 1, **OPTIONS)
+    scores = nb.evaluate(Brightness(127, scale=1).eval(), photographs, 1, **OPTIONS)
     assert (scores.overall.recall.hits, scores.overall.recall.n) == (2, 3)
     assert (scores.overall.false_positive_rate.hits, scores.overall.false_positive_rate.n) == (1, 4)
 
@@ -59,10 +45,10 @@ def test_a_label_may_be_an_index(photographs):
 def test_only_a_given_folder_is_written_and_the_network_stays(photographs, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     before = sorted(tmp_path.rglob("*"))
-    network = Brightness().eval()
+    network = Brightness(127, scale=1).eval()
     nb.evaluate(network, photographs, **OPTIONS)
     assert sorted(tmp_path.rglob("*")) == before
-    assert network.weight.requires_grad and not network.training
+    assert network.limit.requires_grad and not network.training
     nb.evaluate(network, photographs, out="scores", **OPTIONS)
     assert (tmp_path / "scores" / "summary.json").is_file()
 

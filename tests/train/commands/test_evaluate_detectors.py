@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from torchvision.ops import masks_to_boxes
 
 import norm_balls as nb
 from renderer.errors import InputError
+from tests.helpers import BORDER
 
 CLASSES = ["cat", "dog", "cow"]
 
@@ -15,13 +17,12 @@ def _find_white(images):
     """Detect the white rectangle of each image as a dog, and a cow in the upper left corner."""
     outputs = []
     for image in images:
-        rows, columns = torch.nonzero(image.amin(0) > 0.8, as_tuple=True)
-        boxes, labels, scores = [[0.0, 0, 4, 4]], [2], [0.5]
-        if len(rows):
-            box = [columns.min(), rows.min(), columns.max() + 1, rows.max() + 1]
-            boxes, labels = [*boxes, [float(side) for side in box]], [2, 1]
-            scores = [0.5, float(image.max()) - 0.1]
-        output = {"boxes": torch.tensor(boxes), "labels": torch.tensor(labels)}
+        is_white = image.amin(0) > 0.8
+        boxes, labels, scores = torch.tensor([[0.0, 0, 4, 4]]), [2], [0.5]
+        if is_white.any():
+            boxes = torch.cat([boxes, masks_to_boxes(is_white[None]) + BORDER])
+            labels, scores = [2, 1], [0.5, float(image.max()) - 0.1]
+        output = {"boxes": boxes, "labels": torch.tensor(labels)}
         outputs.append(output | {"scores": torch.tensor(scores)})
     return outputs
 

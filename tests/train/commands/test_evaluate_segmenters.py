@@ -1,4 +1,5 @@
 import json
+from contextlib import nullcontext
 from itertools import product
 
 import numpy as np
@@ -97,18 +98,17 @@ def test_a_mask_of_other_classes_or_of_another_size_is_refused(folder, mask, mes
         nb.evaluate(_by_brightness, folder, classes=CLASSES, size=SIZE)
 
 
-def test_masks_of_0_and_255_which_mark_no_object_are_refused(folder):
+@pytest.mark.parametrize(
+    ("level", "outcome"), [(0, pytest.raises(InputError, match="255")), (1, nullcontext())]
+)
+def test_masks_of_255_beside_background_alone_mark_no_object_and_are_refused(
+    folder, level, outcome
+):
     """A network that finds background alone would have the IoU 1."""
     for path in (folder / "masks").rglob("*.png"):
-        Image.fromarray(np.where(_read(path) == 2, 255, 0).astype(np.uint8)).save(path)
-    with pytest.raises(InputError, match="255"):
-        nb.evaluate(_by_brightness, folder, classes=CLASSES, size=SIZE)
-
-
-def test_masks_of_one_class_and_a_border_of_255_are_scored(folder):
-    for path in (folder / "masks").rglob("*.png"):
-        Image.fromarray(np.where(_read(path) == 2, 255, 1).astype(np.uint8)).save(path)
-    assert nb.evaluate(_by_brightness, folder, classes=CLASSES, size=SIZE).by_class
+        Image.fromarray(np.where(_read(path) == 2, 255, level).astype(np.uint8)).save(path)
+    with outcome:
+        assert nb.evaluate(_by_brightness, folder, classes=CLASSES, size=SIZE).by_class
 
 
 def test_a_folder_without_masks_is_refused(folder):

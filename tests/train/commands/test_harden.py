@@ -92,20 +92,16 @@ def test_the_weights_are_those_of_the_command(network, photographs, tmp_path, mo
     assert all(value.equal(expected[name]) for name, value in written.items())
 
 
-def test_a_logger_without_a_method_log_is_refused_before_the_training(network, photographs):
-    with pytest.raises(nb.InputError, match="logger"):
-        harden(network, photographs, logger=print)
-
-
 @pytest.mark.parametrize(
     ("key", "section"),
     [
         ("train.epoch", {"train": {"epoch": 1}}),
         ("train.epochs", {"train": {"epochs": "many"}}),
         ("scene.views", {"scene": {"views": [1]}}),
+        ("logger", {"logger": print}),
     ],
 )
-def test_a_wrong_setting_is_refused_by_its_key(network, photographs, key, section):
+def test_a_wrong_argument_is_refused_by_its_key(network, photographs, key, section):
     with pytest.raises(nb.InputError, match=f"^{key}\\b"):
         harden(network, photographs, **section)
 

@@ -153,12 +153,6 @@ def test_the_run_of_a_detector_is_scored_by_the_boxes_that_it_keeps(
     assert summarize(tmp_path).accuracy == pytest.approx(expected)
 
 
-@pytest.mark.parametrize("name", ["interpolate", "relight_steps"])
-def test_settings_of_classifiers_alone_are_refused(detector, photographs, name):
-    with pytest.raises(InputError, match=f"train.{name}"):
-        harden(detector, photographs, train=SHORT["train"] | {name: 1})
-
-
 LOW_LIGHT = TrainSettings(augmentation="low_light")
 RAW = {"task": Detection(decode=RawCells.decode), "augment": None}
 
@@ -195,24 +189,35 @@ def test_favor_multiplies_the_odds_with_the_lowest_loss():
     assert min(losses) == pytest.approx(0, abs=1e-3)
 
 
+def without_losses() -> nn.Module:
+    network = BrightBox((0, 0, SIZE, SIZE))
+    network.register_parameter("weight", nn.Parameter(torch.ones(1)))
+    return network
+
+
+def bright_box(raw: Tensor) -> list[dict[str, Tensor]]:
+    """Return a box with its label instead of the scores of all classes."""
+    return BrightBox((0, 0, 9, 9))(raw[:, :3, None, None].sigmoid())
+
+
+WITHOUT_SCORES = {"task": Detection(threshold=0.1, decode=bright_box), "augment": None}
+
+
 @pytest.mark.parametrize(
-    ("meshes", "decode", "reason"),
+    ("network", "meshes", "options", "reason"),
     [
-        (("solid:bottle",), RawCells.decode, "meshes: a raw network"),
-        ((), lambda raw: BrightBox((0, 0, 9, 9))(raw[:, :3, None, None].sigmoid()), "labels"),
+        (OneBox(SIZE), ("solid:bottle",), {"train": {"interpolate": 1}}, "train.interpolate"),
+        (OneBox(SIZE), ("solid:bottle",), {"train": {"relight_steps": 1}}, "train.relight_steps"),
+        (RawCells(), ("solid:bottle",), RAW, "meshes: a raw network"),
+        (RawCells(), (), WITHOUT_SCORES, "labels"),
+        (without_losses(), ("solid:bottle",), {}, "training mode"),
     ],
 )
-def test_raw_networks_that_cannot_learn_are_refused(photographs, meshes, decode, reason):
-    task = Detection(threshold=0.1, decode=decode)
+def test_networks_and_settings_that_cannot_train_a_detector_are_refused(
+    photographs, network, meshes, options, reason
+):
     with pytest.raises(InputError, match=reason):
-        harden(RawCells().eval(), photographs, meshes, task=task, augment=None)
-
-
-def test_a_detector_without_losses_is_refused(photographs):
-    network = BrightBox((0, 0, SIZE, SIZE)).eval()
-    network.register_parameter("weight", nn.Parameter(torch.ones(1)))
-    with pytest.raises(InputError, match="training mode"):
-        harden(network, photographs)
+        harden(network.eval(), photographs, meshes, **options)
 
 
 @pytest.mark.slow

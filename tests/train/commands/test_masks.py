@@ -39,35 +39,30 @@ MASKS = {
     "white with transparency": rgba((255, 255, 255, 255), (0, 0, 0, 0)),
     "gray cut-out": rgba((90, 90, 90, 255), (200, 200, 200, 0)).convert("LA"),
     "opaque with alpha": Image.fromarray(WHITE_ON_BLACK).convert("RGBA"),
+    "float, zero and one": Image.fromarray(IS_OBJECT.astype(np.float32)),
+}
+TURNED = Image.Exif()
+TURNED[0x0112] = 3
+# Images with options with which they are saved. A transparent color is outside of the object.
+SAVED = {name: (image, {}) for name, image in MASKS.items()} | {
+    "transparent color": (palette((255, 255, 255), (90, 10, 10)), {"transparency": 0}),
+    "transparent palette": (palette((255, 255, 255), (90, 10, 10)), {"transparency": b"\0\xff"}),
+    "turned": (Image.fromarray(WHITE_ON_BLACK[::-1, ::-1].copy()), {"exif": TURNED}),
 }
 
 
-def save(path: Path, image: Image.Image, **options: object) -> str:
+def save(folder: Path, image: Image.Image, **options: object) -> str:
+    path = folder / ("mask.tif" if image.mode == "F" else "mask.png")
     image.save(path, **options)
     return str(path)
 
 
-@pytest.mark.parametrize("name", MASKS)
+@pytest.mark.parametrize("name", SAVED)
 def test_masks_of_every_kind_mark_the_object(tmp_path, name):
-    mask = read_mask(save(tmp_path / "mask.png", MASKS[name]), 12, 16)
+    image, options = SAVED[name]
+    mask = read_mask(save(tmp_path, image, **options), 12, 16)
     assert mask.dtype == np.uint8
     np.testing.assert_array_equal(mask, WHITE_ON_BLACK)
-
-
-@pytest.mark.parametrize("transparency", [0, b"\0\xff"])
-def test_the_transparent_color_of_a_palette_is_outside_of_the_object(tmp_path, transparency):
-    image = palette((255, 255, 255), (90, 10, 10))
-    path = save(tmp_path / "mask.png", image, transparency=transparency)
-    np.testing.assert_array_equal(read_mask(path, 12, 16), WHITE_ON_BLACK)
-
-
-def test_float_masks_of_zero_and_one_and_turned_masks_mark_the_object(tmp_path):
-    path = save(tmp_path / "mask.tif", Image.fromarray(IS_OBJECT.astype(np.float32)))
-    np.testing.assert_array_equal(read_mask(path, 12, 16), WHITE_ON_BLACK)
-    exif = Image.Exif()
-    exif[0x0112] = 3
-    path = save(tmp_path / "a.png", Image.fromarray(WHITE_ON_BLACK[::-1, ::-1].copy()), exif=exif)
-    np.testing.assert_array_equal(read_mask(path, 12, 16), WHITE_ON_BLACK)
 
 
 def test_soft_edges_keep_their_coverage(tmp_path):
@@ -75,8 +70,8 @@ def test_soft_edges_keep_their_coverage(tmp_path):
     soft[2] //= 2
     cut_out = np.dstack([np.full((12, 16, 3), 90, np.uint8), soft])
     for pixels in (soft, soft.astype(np.uint16) * 257, cut_out):
-        path = save(tmp_path / "mask.png", Image.fromarray(pixels))
-        np.testing.assert_array_equal(read_mask(path, 12, 16), soft)
+        mask = read_mask(save(tmp_path, Image.fromarray(pixels)), 12, 16)
+        np.testing.assert_array_equal(mask, soft)
 
 
 def three_colors() -> Image.Image:
@@ -107,4 +102,4 @@ NO_MASKS = {
 @pytest.mark.parametrize("name", NO_MASKS)
 def test_a_mask_that_does_not_tell_where_the_object_is_is_refused(tmp_path, name):
     with pytest.raises(InputError, match=r"mask=.*mask\.png"):
-        read_mask(save(tmp_path / "mask.png", NO_MASKS[name]), 12, 16)
+        read_mask(save(tmp_path, NO_MASKS[name]), 12, 16)

@@ -10,6 +10,7 @@ import torch
 from PIL import Image
 from torch import Tensor, nn
 from torchvision.models import mobilenet_v3_small
+from torchvision.transforms.functional import normalize
 
 import augment
 from renderer.errors import InputError
@@ -25,8 +26,7 @@ CLASSES = (
     *("Apple", "ball", "bottle", "cup", "lemon", "mushroom", "Orange", "pear", "plate"),
     "Sweet pepper",
 )
-MEAN = torch.tensor((0.485, 0.456, 0.406)).view(3, 1, 1)
-STD = torch.tensor((0.229, 0.224, 0.225)).view(3, 1, 1)
+IMAGENET = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 OWN = [
     *(f"network=torchvision:{NAME}", "weights=mine.pth", "classes=classes.txt", f"size={SIZE}"),
     "device=cpu",
@@ -52,7 +52,7 @@ def trained_weights() -> dict[str, Tensor]:
     """Fit the last layer, so that the logit of an image is 10 for its class, and otherwise 0."""
     torch.manual_seed(0)
     network = mobilenet_v3_small(num_classes=len(CLASSES))
-    images = (renders() - MEAN) / STD
+    images = normalize(renders(), *IMAGENET)
     for module in network.modules():
         if isinstance(module, nn.BatchNorm2d):
             module.momentum = None  # The statistics are those of the images.
@@ -147,4 +147,4 @@ def test_a_network_in_a_file_begins_with_the_normalization_of_the_user(here, mon
     built = build_network(initial.classes, SIZE, trust_code=True, **shape)
     initial.copy_to(built, shape | {"classes": list(initial.classes), "size": SIZE})
     images = renders()[:4]
-    torch.testing.assert_close(built(images), network((images - MEAN) / STD), **ROUNDING)
+    torch.testing.assert_close(built(images), network(normalize(images, *IMAGENET)), **ROUNDING)

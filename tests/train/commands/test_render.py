@@ -60,11 +60,6 @@ def details(folder: Path, index: int) -> dict:
     return json.loads((folder / "details" / f"{index:06d}.json").read_text())
 
 
-def decoded(counts: list[int], size: list[int]) -> np.ndarray:
-    values = np.repeat(np.arange(len(counts)) % 2, counts)
-    return values.reshape(size[::-1]).T.astype(bool)
-
-
 def test_parts_without_a_render_of_a_class_number_the_classes_alike(meshes, tmp_path):
     out = write(meshes, tmp_path / "out", count=3, maps=[])
     parts = [ImageFolder(str(out / part), allow_empty=True) for part in ("train", "val")]
@@ -89,12 +84,12 @@ def test_boxes_and_run_lengths_of_coco_are_those_of_the_mask(meshes, tmp_path):
         assert item["image_id"] == image["id"]
         assert (folder / "val" / image["file_name"]).exists()
         mask = np.array(Image.open(folder / "details" / f"{image['id'] - 1:06d}_mask.png"))
-        segmentation = item["segmentation"]
-        assert (decoded(segmentation["counts"], segmentation["size"]) == (mask == 1)).all()
-        rows, columns = np.nonzero(mask)
+        counts, size = (item["segmentation"][key] for key in ("counts", "size"))
+        decoded = np.repeat(np.arange(len(counts)) % 2, counts).reshape(size[::-1]).T
+        assert (decoded == (mask == 1)).all()
         left, top, width, height = item["bbox"]
-        assert (left, left + width) == (columns.min(), columns.max() + 1)
-        assert (top, top + height) == (rows.min(), rows.max() + 1)
+        box = left, top, left + width, top + height
+        assert box == Image.fromarray(mask).getbbox()
         assert item["area"] == (mask == 1).sum()
 
 
@@ -299,19 +294,12 @@ def test_pycocotools_and_torchvision_read_boxes_and_masks(groups, tmp_path):
             assert (target["masks"][order].bool().numpy() == mask).all()
 
 
-@pytest.mark.ecosystem
-@pytest.mark.filterwarnings("ignore")
-def test_an_attack_on_the_pose_renders_silhouettes():
-    """The gradient by the pose needs them, as the attack says otherwise."""
-    chosen = main.read(["out=out", "attack@augment.attack=[pose]"])
-    assert [*chosen.augment.attack.parameters] == ["pose"]
-    assert chosen.renderer.silhouettes and not main.read(["out=out"]).renderer.silhouettes
-
-
 def test_the_parts_of_the_command_line_replace_those_of_the_default():
     assert main.read(["out=out", "splits={train: 1}"]).splits == {"train": 1}
 
 
+@pytest.mark.ecosystem
+@pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("splits", [{"train": 2, "val": 1}, {"train": 1}])
 def test_ultralytics_reads_boxes_and_classes(groups, tmp_path, splits):
     pytest.importorskip("ultralytics")

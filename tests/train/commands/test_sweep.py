@@ -3,7 +3,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -13,17 +13,17 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.train.helpers import read_markdown
+from tests.train.helpers import modification_times, read_markdown
 from train import __main__ as command
 from train.__main__ import run_name
 from train.cli import USER_ERROR, expand
-from train.commands import experiment
 from train.commands.experiment import format_sweep
 from train.run_config import write_config
 from train.run_folder import FAILURE, LAST, LOCK, locked, read_metrics
 from train.training import loop
 from train.training.run import Run
 
+pytestmark = pytest.mark.usefixtures("no_report")
 ROOT = Path(__file__).parents[3]
 SMALL = [
     *("experiment=paper", "augment=none", "data=npz", "model.depth=10", "model.width=1"),
@@ -32,31 +32,11 @@ SMALL = [
 ]
 
 
-@pytest.fixture(autouse=True, scope="module")
-def no_report() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            experiment, "report_of", lambda folders, out: f"report: {len(folders)} in {out}"
-        )
-        yield
-
-
-@pytest.fixture(scope="module")
-def run_sweep(tiny_npz) -> Callable[..., int | None]:
+@pytest.fixture
+def run_sweep(call, tiny_npz) -> Callable[..., int]:
     """Return a function that trains by a sweep in this process, and returns the exit status."""
-
-    def run(folder: Path, *overrides: str) -> int | None:
-        arguments = [*SMALL, f"data.path={tiny_npz}", f"sweep={folder}", *overrides]
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(sys, "argv", ["train", "--multirun", *arguments])
-            patch.setattr("hydra._internal.hydra.Hydra.get_mode", lambda *_, **__: None)
-            try:
-                command.main()
-            except SystemExit as stop:
-                return stop.code
-        return 0
-
-    return run
+    words = "train", "--multirun", *SMALL, f"data.path={tiny_npz}"
+    return lambda folder, *overrides: call(*words, f"sweep={folder}", *overrides)
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +54,7 @@ def folder_of(tiny_npz) -> Callable[..., Path]:
     return find
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def swept(run_sweep, tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("sweeps") / "swept"
     assert run_sweep(folder, "seed=0,1") == 0
@@ -128,21 +108,12 @@ def test_file_systems_and_command_lines_take_the_name_of_a_run(values):
     assert override.value() == f"runs/sweep/{name}"
 
 
-def read_files(folders: list[Path]) -> dict[Path, tuple[bytes, int]]:
-    files = {}
-    for folder in folders:
-        for path in folder.rglob("*"):
-            if path.is_file() and path.name != LOCK:
-                files[path] = (path.read_bytes(), path.stat().st_mtime_ns)
-    return files
-
-
 @pytest.mark.slow
 def test_a_second_call_trains_nothing_and_shows_finished_runs(run_sweep, folder_of, swept, capsys):
     folders = [folder_of(swept, f"seed={seed}") for seed in (0, 1)]
-    before = read_files(folders)
+    before = [modification_times(folder) for folder in folders]
     assert run_sweep(swept, "seed=0,1") == 0
-    assert read_files(folders) == before
+    assert [modification_times(folder) for folder in folders] == before
     (table,) = read_markdown(capsys.readouterr().out).values()
     assert [row[:2] for row in table] == [["network", "runs"], ["none", "2"]]
 
@@ -213,10 +184,7 @@ def test_a_failed_run_is_reported_with_its_reason_and_tried_again_and_stops_no_o
         ("photos=null,missing", "photos: missing is not a folder"),
     ],
 )
-def test_a_wrong_setting_fails_before_any_run(
-    run_sweep, tmp_path, monkeypatch, capsys, override, start
-):
-    monkeypatch.chdir(tmp_path)
+def test_a_wrong_setting_fails_before_any_run(run_sweep, tmp_path, capsys, override, start):
     assert run_sweep(tmp_path / "sweep", override) == USER_ERROR
     printed = capsys.readouterr()
     assert printed.err.startswith(f"error: {start}")

@@ -27,10 +27,6 @@ def numbered(images: torch.Tensor) -> batches.TrainingImages:
     return batches.TrainingImages(split, split[:0])
 
 
-def gray_images(count: int) -> torch.Tensor:
-    return torch.arange(count, dtype=torch.uint8).view(-1, 1, 1, 1).expand(-1, 3, 8, 8)
-
-
 @pytest.mark.parametrize("shape", [(5, 5), (6, 11)])
 @pytest.mark.parametrize("is_flipped", [False, True])
 def test_crops_are_those_of_a_reflect_padded_image_for_every_shift(shape, is_flipped):
@@ -106,7 +102,8 @@ def test_alternating_flips_show_each_image_mirrored_in_every_other_epoch(is_on_d
 
 
 def test_an_epoch_shows_every_image_once_and_fills_the_last_batch_with_the_first_images():
-    shown = batches.training_batches(numbered(gray_images(100)), 7, 0, epoch_round(100, 0))
+    images = numbered(noise(100, 3, 8, 8))
+    shown = batches.training_batches(images, 7, 0, epoch_round(100, 0))
     labels = [labels for _, labels, _ in shown]
     assert [len(batch) for batch in labels] == [7] * 15
     order = torch.cat(labels).tolist()

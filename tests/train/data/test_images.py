@@ -6,6 +6,7 @@ import torch
 from PIL import Image
 
 from renderer.errors import InputError
+from tests.helpers import save_plain
 from train.data.batches import Round, TrainingImages, training_batches
 from train.data.photographs import find_unlabeled, load_photographs
 from train.data.sets import ImageFiles, Split, load_folder, load_unlabeled
@@ -71,9 +72,8 @@ def test_reading_images_draws_nothing_from_the_global_generator(files):
 
 def test_a_broken_file_is_named_or_another_of_its_folder_stands_in(tmp_path, caplog):
     for name, color in (("lemon", "yellow"), ("orange", "red")):
-        (tmp_path / name).mkdir()
         for file in ("a.png", "b.png"):
-            Image.new("RGB", (80, 80), color).save(tmp_path / name / file)
+            save_plain(tmp_path / name / file, color, (80, 80))
     whole = (tmp_path / "lemon" / "b.png").read_bytes()
     (tmp_path / "lemon" / "b.png").write_bytes(whole[:100])
     rows = [torch.arange(4)]
@@ -86,9 +86,8 @@ def test_a_broken_file_is_named_or_another_of_its_folder_stands_in(tmp_path, cap
 
 def test_batches_from_disk_have_labeled_images_and_renders_and_go_on_where_they_stopped(tmp_path):
     for name, color in {"a": (10, 0, 0), "b": (20, 0, 0), "c": (30, 0, 0)}.items():
-        (tmp_path / name).mkdir()
         for number in range(4):
-            Image.new("RGB", (90, 80), color).save(tmp_path / name / f"{number}.png")
+            save_plain(tmp_path / name / f"{number}.png", color, (90, 80))
     data = load_folder(str(tmp_path), SIZE, 0.25)
     assert isinstance(data.train.images, ImageFiles)
     assert data.size == SIZE

@@ -9,6 +9,7 @@ from PIL import Image
 
 from augment.tasks.classification import class_index
 from renderer.errors import InputError
+from tests.helpers import save_plain
 from train.class_names import classes_of_meshes
 from train.data import photographs
 
@@ -19,10 +20,6 @@ def save(path: Path, pixels: np.ndarray | Image.Image, **options) -> Path:
     image = pixels if isinstance(pixels, Image.Image) else Image.fromarray(pixels)
     image.save(path, **options)
     return path
-
-
-def plain(color=(255, 128, 0)) -> Image.Image:
-    return Image.new("RGB", (32, 32), color)
 
 
 def touch(folder: Path, *names: str) -> Path:
@@ -211,7 +208,12 @@ def test_a_large_jpeg_decoded_small_equals_one_decoded_in_full(tmp_path):
 @pytest.mark.parametrize(
     ("name", "image", "options", "expected"),
     [
-        ("color-key.png", plain((10, 20, 30)), {"transparency": (10, 20, 30)}, (255, 255, 255)),
+        (
+            "color-key.png",
+            Image.new("RGB", (9, 9), (10, 20, 30)),
+            {"transparency": (10, 20, 30)},
+            (255, 255, 255),
+        ),
         ("alpha.png", Image.new("RGBA", (40, 40), (255, 0, 0, 51)), {}, (255, 204, 204)),
         ("cmyk.jpg", Image.new("CMYK", (40, 40), (0, 255, 255, 0)), {"quality": 100}, (255, 0, 0)),
     ],
@@ -234,7 +236,7 @@ def test_unreadable_images_are_named_or_skipped(tmp_path):
         with pytest.raises(InputError, match=r"3 of 3 .*cut\.jpg .*replace them$"):
             photographs.load_photographs(tmp_path, found, skip_unreadable=skip_unreadable)
 
-    save(tmp_path / "good.png", plain())
+    save_plain(tmp_path / "good.png", (255, 128, 0), (32, 32))
     found = photographs.find_photographs(tmp_path, CLASSES, "orange")
     with pytest.raises(InputError, match=r"3 of 4 .*cut\.jpg .* set skip_unreadable=True"):
         photographs.load_photographs(tmp_path, found)

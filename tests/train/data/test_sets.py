@@ -1,14 +1,13 @@
 import re
 from itertools import product
-from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 
 from renderer.errors import InputError
+from tests.helpers import save_plain
 from train.data import sets
 
 
@@ -31,11 +30,6 @@ def numbered(count: int, classes: int = 1) -> sets.Split:
 def test_a_sample_is_spread_evenly_over_the_images():
     for count, rows in (3, [0, 4, 8]), (20, [*range(9)]):
         assert numbered(9).sample(count)[:, 0, 0, 0].tolist() == rows
-
-
-def save_image(path: Path, value: int, size: tuple[int, int] = (8, 8)) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.new("RGB", size, (value, value, value)).save(path)
 
 
 def test_an_npz_file_comes_back_as_it_was_written(tmp_path):
@@ -74,7 +68,7 @@ def test_a_fault_in_an_npz_file_is_named(tmp_path, changes, fault):
 def test_class_folders_become_classes_and_images_of_any_size_are_reduced(tmp_path):
     for name, number in product(["lime", "fig"], range(10)):
         value = number + 100 * (name == "fig")
-        save_image(tmp_path / name / f"{number}.png", value, size=(20 + number, 30))
+        save_plain(tmp_path / name / f"{number}.png", value, size=(20 + number, 30))
     (tmp_path / ".thumbnails").mkdir()
     data = sets.load_folder(str(tmp_path), size=8, test_fraction=0.2)
     assert data.classes == ("fig", "lime")
@@ -90,7 +84,7 @@ def test_class_folders_become_classes_and_images_of_any_size_are_reduced(tmp_pat
 
 def test_train_and_test_folders_are_the_splits(tmp_path):
     for part, name, value in [("train", "fig", 1), ("train", "lime", 2), ("test", "lime", 3)]:
-        save_image(tmp_path / part / name / "a.png", value)
+        save_plain(tmp_path / part / name / "a.png", value)
     data = sets.load_folder(str(tmp_path), size=8, test_fraction=0.1)
     assert data.train.images[:, 0, 0, 0].tolist() == [1, 2]
     assert data.train.labels.tolist() == [0, 1]
@@ -112,7 +106,7 @@ def test_train_and_test_folders_are_the_splits(tmp_path):
 )
 def test_a_fault_in_a_folder_is_named(tmp_path, images, fault):
     for name in images:
-        save_image(tmp_path / "data" / name, 0)
+        save_plain(tmp_path / "data" / name, 0)
     with pytest.raises(InputError, match=fault):
         sets.load_folder(str(tmp_path / "data"), 8, 0.1)
 

@@ -5,9 +5,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from PIL import Image
 
-from tests.helpers import darker_than
+from tests.helpers import darker_than, save_plain
+from tests.train.helpers import attack_shortly
 from train.auditing import lights
 from train.command_settings import AuditSettings
 from train.commands import audit
@@ -55,9 +55,8 @@ LOWEST_CONTRAST = """([needed, neededIfLarge]) => {
 def page(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("audit")
     for label in CLASSES:
-        (folder / "lab" / label).mkdir(parents=True)
-        for name, color in {"black": "black", "gray": "#808080"}.items():
-            Image.new("RGB", (8, 8), color).save(folder / "lab" / label / f"{name}.png")
+        for level in (0, 128):
+            save_plain(folder / "lab" / label / f"{level}.png", level)
     given = {"network": "original", "meshes": ["solid:orange:0"], "environments": []}
     folders = {"laboratory": str(folder / "lab"), "out": str(folder / "out")}
     settings = AuditSettings(**given, **folders, budget=0.1, device="cpu")
@@ -67,11 +66,8 @@ def page(tmp_path_factory) -> Path:
     }
     kind = lights.KINDS["lighting"]._replace(radii=(0.1, 3.0))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(lights, "STEPS", 3)
-        patch.setattr(lights, "ADDITIONAL_STEPS", 3)
+        attack_shortly(patch, "lighting", steps=3, additional=3)
         patch.setattr(lights, "FRAME_COUNT", 7)
-        for name in ("skylight", "projector", "lamps"):
-            patch.delitem(lights.KINDS, name)
         patch.setitem(lights.KINDS, "lighting", kind)
         patch.setattr(audit, "RANDOM_LIGHT_COUNT", 1)
         return run_audit(settings, networks).path

@@ -1,21 +1,18 @@
 import re
 from collections.abc import Callable, Sequence
 from itertools import product
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from shutil import copytree
 
 import numpy as np
 import pytest
-import torch
 
-from tests.train.helpers import read_markdown
-from train.data.photo import Photograph
+from tests.train.helpers import evaluation_of, ranked, read_markdown
 from train.results import compare as comparison
 from train.results.metrics import Pool, Pooled
 from train.results.page import write_report
 from train.results.predictions import Predictions, write_predictions
-from train.results.scoring import rank_classes
-from train.results.store import RunSummary, ScoredRun, summarize
+from train.results.store import ScoredRun, summarize
 
 # Scores of oranges and scores of other things, by source.
 Scores = dict[str | None, tuple[Sequence[float], Sequence[float]]]
@@ -41,12 +38,8 @@ def rows_of(scores: Scores) -> Rows:
 
 def predictions_of(rows: Rows, other: str = "pear") -> Predictions:
     """Make the predictions of a network that knows two fruits, by the sign of the score."""
-    photographs = [
-        Photograph(PurePosixPath(f"{label}/{index:03}.png"), label, source)
-        for index, (label, source, _) in enumerate(rows)
-    ]
-    logits = torch.tensor([[score, 0.0] for *_, score in rows], dtype=torch.float64)
-    return rank_classes(photographs, logits, ["orange", other], ["orange"])
+    labels, sources, scores = zip(*rows, strict=True)
+    return ranked(labels, [[score, 0.0] for score in scores], ["orange", other], sources=sources)
 
 
 @pytest.fixture
@@ -232,10 +225,8 @@ def test_without_the_metric_of_one_seed_there_is_no_difference(scored_run):
 def test_networks_with_different_classes_have_no_difference_of_top_1_on_different_images(apples):
     rows = [(*shown, 1.0) for shown in [("orange", "web")] * 9 + [("pear", "web")] * 7]
     rows += [("apple", "web", -1.0)] * apples
-    run = RunSummary(Path("run"), "", {}, {}, None)
     one, same, other = (
-        [comparison.Evaluation(run, Pooled(predictions_of(rows, name)))]
-        for name in ("pear", "pear", "apple")
+        [evaluation_of(predictions_of(rows, name))] for name in ("pear", "pear", "apple")
     )
     for metric in ("class_top1", "class_top5"):
         assert comparison.difference(other, one, comparison.ALL, metric) is None

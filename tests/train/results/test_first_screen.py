@@ -1,18 +1,11 @@
 import re
-from pathlib import Path, PurePosixPath
 
-import numpy as np
 import pytest
-import torch
-from PIL import Image
 
-from train.data.photo import Photograph
-from train.results.compare import Evaluation
+from tests.helpers import save_plain
+from tests.train.helpers import evaluation_of, ranked
 from train.results.first_screen import FirstScreen, choose_disagreements, compare_networks
-from train.results.metrics import Pooled
 from train.results.predictions import Predictions
-from train.results.scoring import rank_classes
-from train.results.store import RunSummary
 
 # Classes of the images, and the classes that two networks predict.
 SHOWN = ("banana", "mug", "mug", "other_cup", "other_cup", "banana")
@@ -23,18 +16,13 @@ LABELS = ("banana", "mug")
 
 def predictions_of(predicted: tuple[str, ...], labels: tuple[str, ...] = LABELS) -> Predictions:
     classes = ("banana", "mug", "spoon")
-    photographs = [
-        Photograph(PurePosixPath(f"{number}.png"), shown, f"source {number}")
-        for number, shown in enumerate(SHOWN)
-    ]
-    logits = torch.tensor([[float(name == other) for other in classes] for name in predicted])
-    return rank_classes(photographs, logits, classes, labels)
+    logits = [[float(name == other) for other in classes] for name in predicted]
+    return ranked(SHOWN, logits, classes, labels, [f"source {number}" for number in range(6)])
 
 
 def test_an_image_of_one_of_several_classes_is_right_if_its_own_class_is_predicted(tmp_path):
-    for number in range(len(SHOWN)):
-        pixels = np.full((8, 8, 3), 20 * number, dtype=np.uint8)
-        Image.fromarray(pixels).save(tmp_path / f"{number}.png")
+    for number, name in enumerate(SHOWN):
+        save_plain(tmp_path / name / f"{number:03}.png", 20 * number)
     before, after = predictions_of(BEFORE), predictions_of(AFTER)
     rows = choose_disagreements(before, after, tmp_path)
     gained, lost = rows.values()
@@ -42,16 +30,14 @@ def test_an_image_of_one_of_several_classes_is_right_if_its_own_class_is_predict
     assert {item.subject for item in gained} == {"banana, source 0", "cup, source 3"}
     assert {item.subject for item in lost} == {"mug, source 1", "cup, source 4"}
     assert [re.findall(r"\d+", title) for title in rows] == [["2", "6"], ["2", "6"]]
-    (tmp_path / "0.png").unlink()
+    (tmp_path / "banana" / "000.png").unlink()
     gained, lost = choose_disagreements(before, after, tmp_path).values()
     assert [[item.subject for item in gained], len(lost)] == [["cup, source 3"], 2]
 
 
 def screen_of(labels: tuple[str, ...]) -> FirstScreen:
-    run = RunSummary(Path("run"), "", {}, {}, None)
     before, after = (
-        [Evaluation(run, Pooled(predictions_of(predicted, labels)))]
-        for predicted in (BEFORE, AFTER)
+        [evaluation_of(predictions_of(predicted, labels))] for predicted in (BEFORE, AFTER)
     )
     return compare_networks(before, after, ("before", "after"))
 

@@ -1,7 +1,5 @@
-from dataclasses import replace
 from fractions import Fraction
 from functools import partial
-from pathlib import PurePosixPath
 
 import numpy as np
 import pytest
@@ -12,10 +10,9 @@ from scipy.stats import binomtest, mannwhitneyu, sem, ttest_1samp
 from scipy.stats import t as student_t
 
 from benchmarks.coverage import Setup, heavy_tails, measure
-from train.data.photo import Photograph
+from tests.train.helpers import ranked
 from train.results import intervals
 from train.results.metrics import AT_THRESHOLD, Pool
-from train.results.scoring import rank_classes
 from train.results.tables import OBJECTS, THESE_OBJECTS
 
 # The scores have few values, so that ties are common.
@@ -173,15 +170,12 @@ def test_equal_networks_have_equal_recalls():
     [(4, 0, THESE_OBJECTS), (5, 0, OBJECTS), (5, 1, THESE_OBJECTS), (1, 39, THESE_OBJECTS)],
 )
 def test_few_or_unknown_objects_have_an_interval_over_images(object_count, unnamed, over):
-    photographs = [
-        Photograph(PurePosixPath(f"{number}.png"), name, None, (), f"{name}{number % count}.glb")
-        for name, count in {"orange": object_count, "pear": 9}.items()
-        for number in range(40 if name == "orange" else 50)
-    ]
-    photographs[:unnamed] = [replace(item, mesh=None) for item in photographs[:unnamed]]
+    labels = ["orange"] * 40 + ["pear"] * 50
+    meshes = [f"{number % object_count}.glb" for number in range(40)]
+    meshes += [f"{number % 9}.glb" for number in range(50)]
+    meshes[:unnamed] = [None] * unnamed
     logits = torch.randn(90, 2, generator=torch.Generator().manual_seed(1))
-    scored = Pool(rank_classes(photographs, logits, ["orange", "pear"], ["orange"]))
-    metrics = scored.metrics
+    metrics = Pool(ranked(labels, logits, ["orange", "pear"], meshes=meshes)).metrics
     assert (metrics.auc.over, metrics.recall.over) == (over, over)
     assert metrics.false_positive_rate.over == OBJECTS
     assert metrics.auc.positive_objects == object_count
@@ -210,21 +204,17 @@ def test_means_over_drawn_classes_count_repeated_images():
 def test_top_k_is_that_of_torch_for_images_of_known_classes(labels):
     classes = ["orange", "lemon", "pear", *map(str, range(9))]
     generator = torch.Generator().manual_seed(0)
-    photographs = [
-        Photograph(PurePosixPath(f"{name}/{number}"), name, None, (), f"{name}{number // 2}.glb")
-        for name, count in {"orange": 8, "lemon": 4, "pear": 2, "other_ball": 6}.items()
-        for number in range(count)
-    ]
-    logits = torch.randn(len(photographs), len(classes), generator=generator)
+    shown = np.repeat(["orange", "lemon", "pear", "other_ball"], [8, 4, 2, 6])
+    meshes = [f"{number // 2}.glb" for number in range(len(shown))]
+    logits = torch.randn(len(shown), len(classes), generator=generator)
     logits[:, :3] += 1.5
-    metrics = Pool(rank_classes(photographs, logits, classes, labels)).metrics
+    metrics = Pool(ranked(shown, logits, classes, labels, meshes=meshes)).metrics
 
     for rank, metric in ((1, metrics.class_top1), (5, metrics.class_top5)):
         best = logits.topk(rank).indices
         by_class = []
         for name in ("orange", "lemon", "pear"):
-            rows = [row for row, item in enumerate(photographs) if item.label == name]
-            hits = (best[rows] == classes.index(name)).any(1)
+            hits = (best[torch.from_numpy(shown == name)] == classes.index(name)).any(1)
             by_class.append(hits.float().mean().item())
         assert metric.value == pytest.approx(np.mean(by_class))
         assert metric.low < metric.value < metric.high
@@ -232,10 +222,9 @@ def test_top_k_is_that_of_torch_for_images_of_known_classes(labels):
 
 def test_a_prediction_is_held_against_the_threshold_of_its_own_label():
     # The log-odds of pear are those of orange with the opposite sign.
-    shown = [("orange", 1.0), ("orange", -2.0), ("pear", -3.0), ("pear", -6.0)]
-    photographs = [Photograph(PurePosixPath(name), name, None) for name, _ in shown]
-    logits = torch.tensor([[score, 0.0] for _, score in shown])
-    predictions = rank_classes(photographs, logits, ["orange", "pear"], ["orange", "pear"])
+    labels, scores = ["orange", "orange", "pear", "pear"], [1.0, -2.0, -3.0, -6.0]
+    fruit = ["orange", "pear"]
+    predictions = ranked(labels, [[score, 0.0] for score in scores], fruit, fruit)
     outcomes = Pool(predictions, {"orange": 0.0, "pear": 5.0}).outcomes
     # The first orange exceeds 0, and the last pear 5. No other object exceeds either.
     assert [outcomes[name].hits.sum() for name in AT_THRESHOLD] == [2, 0]

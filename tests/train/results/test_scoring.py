@@ -10,8 +10,10 @@ import pytest
 import torch
 from PIL import Image
 from scipy.special import logsumexp, softmax
+from torch import Tensor
 
 from renderer.errors import InputError
+from tests.helpers import save_plain
 from train.data.photo import Photograph
 from train.results import scoring
 from train.results.metrics import AT_THRESHOLD, METRICS
@@ -20,29 +22,22 @@ from train.results.predictions import read_predictions, write_predictions
 from train.results.tables import THESE_OBJECTS, fraction
 
 
-class TableModel(torch.nn.Module):
-    def __init__(self, table):
-        super().__init__()
-        self.table = torch.as_tensor(table, dtype=torch.float32)
-
-    def forward(self, images):
-        assert images.dtype == torch.float32
-        assert images.ndim == 4
-        assert images.shape[1] == 3
-        red = 255 * images[:, 0].mean(dim=(1, 2))
-        return self.table[red.round().long()]
-
-
 @pytest.fixture
-def known_model(tmp_path) -> Callable[..., tuple[TableModel, list[str], Path]]:
+def known_model(tmp_path) -> Callable[..., tuple[Callable[[Tensor], Tensor], list[str], Path]]:
     """Return a function that makes a model, its classes, and images with the given logits."""
 
-    def make(names, logits, classes) -> tuple[TableModel, list[str], Path]:
+    def make(names, logits, classes) -> tuple[Callable[[Tensor], Tensor], list[str], Path]:
+        table = torch.as_tensor(logits, dtype=torch.float32)
+
+        def model(images: Tensor) -> Tensor:
+            assert images.dtype == torch.float32 and images.shape[1] == 3
+            red = 255 * images[:, 0].mean(dim=(1, 2))
+            return table[red.round().long()]
+
         folder = tmp_path / "photos"
         for red, name in enumerate(names):
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            Image.new("RGB", (32, 32), (red, 0, 0)).save(folder / name)
-        return TableModel(logits), classes, folder
+            save_plain(folder / name, (red, 0, 0), (32, 32))
+        return model, classes, folder
 
     return make
 
@@ -92,16 +87,14 @@ COUNTS = {"photographs": 10, "positives": 5, "negatives": 5}
 
 
 def write_table(folder: Path, **columns: list[str]) -> None:
+    facts = {"path": [item.name for item in FRUIT], "source_tag": [item.source for item in FRUIT]}
+    facts |= columns
     with open(folder / "photos.csv", "w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["path", "source_tag", *columns])
-        for row, fruit in enumerate(FRUIT):
-            values = [column[row] for column in columns.values()]
-            writer.writerow([fruit.name, fruit.source, *values])
+        csv.writer(file).writerows([[*facts], *zip(*facts.values(), strict=True)])
 
 
 @pytest.fixture
-def fruit(known_model) -> tuple[TableModel, list[str], Path]:
+def fruit(known_model) -> tuple[Callable[[Tensor], Tensor], list[str], Path]:
     logits = [[-item.place(name) for name in FRUIT_CLASSES] for item in FRUIT]
     model, classes, folder = known_model([item.name for item in FRUIT], logits, FRUIT_CLASSES)
     write_table(folder)
@@ -232,7 +225,7 @@ class TestAnOperatingPoint:
         (point,) = scoring.choose_operating_points(predictor, folder, "orange", rate)
         if not is_in_sample:
             # Another image that has the same predictions takes the place of an orange.
-            Image.new("RGB", (32, 32), (1, 1, 0)).save(folder / "orange" / "b.png")
+            save_plain(folder / "orange" / "b.png", (1, 1, 0), (32, 32))
         summary = evaluate(*fruit, "orange", tmp_path / "out", points=[point])
         assert summary["recall_at_threshold"] == wilson(recall, 5)
         assert summary["false_positive_rate_at_threshold"] == wilson(false_positives, 5)

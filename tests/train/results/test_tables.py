@@ -10,14 +10,6 @@ from train.results import tables
 from train.results.tables import Proportion, Table, format_fraction, format_interval, fraction
 
 
-def test_a_fraction_has_the_wilson_interval():
-    """The ends are 1.96 standard errors from (8 + z² / 2) / (40 + z²), z = 1.96 (Wilson 1927)."""
-    expected = {"value": 0.2, "low": 0.10500, "high": 0.34757, "hits": 8, "n": 40}
-    found = vars(fraction(8, 40))
-    assert found.pop("over") == "images"
-    assert found == pytest.approx(expected, rel=1e-4)
-
-
 def test_the_range_of_seeds_is_not_called_an_interval():
     of_seeds = tables.Estimate(0.5, 0.4, 0.6, f"{tables.RANGE} of 2 seeds")
     of_images = tables.Estimate(0.5, 0.4, 0.6, "images")

@@ -3,18 +3,18 @@
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from torch import Tensor, nn
 from torchvision.models import get_model
+from torchvision.transforms.functional import normalize
 
 from augment.exposure import normalize_light
 from augment.settings import NormalizedLightSettings
 from augment.sources import load_classifier
 from renderer.errors import InputError
-from tests.helpers import save_noise
 from tests.runs import completed_run
+from tests.train.helpers import SHORT_TRAINING
 from train.__main__ import main as train_command
 from train.checkpoints import load_run
 from train.run_folder import read_metrics
@@ -23,19 +23,8 @@ from train.training.inputs import load_data
 NAME = "shufflenet_v2_x0_5"
 SIZE = 32
 SETTINGS = [
-    "experiment=harden",
-    "augment=none",
-    f"network=torchvision:{NAME}",
-    f"size={SIZE}",
-    "data.test_fraction=0.25",
-    "data.validation=0.25",
-    "train.device=cpu",
-    "train.precision=float32",
-    "train.threads=1",
-    "train.batch_size=8",
-    "train.images_per_epoch=16",
-    "train.learning_rate=0.001",
-    "train.distillation_weight=1",
+    *("experiment=harden", "augment=none", *SHORT_TRAINING, "train.images_per_epoch=16"),
+    *("train.learning_rate=0.001", "train.distillation_weight=1"),
 ]
 # Learning rate with which the weights hardly move.
 ALMOST_FIXED = "train.learning_rate=1e-12"
@@ -44,21 +33,10 @@ IMAGENET_STD = (0.229, 0.224, 0.225)
 
 
 @pytest.fixture(scope="module")
-def photos(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("photos")
-    rng = np.random.default_rng(0)
-    for name in ("orange", "lemon"):
-        for number in range(16):
-            dark = 150 * (number % 2)
-            save_noise(folder / name / f"{number}.png", rng, (40, 36), dark, dark + 100)
-    return folder
-
-
-@pytest.fixture(scope="module")
-def tuned(weights, photos, tmp_path_factory) -> Callable[..., tuple[Path, dict[str, float]]]:
+def tuned(weights, photographs, tmp_path_factory) -> Callable[..., tuple[Path, dict[str, float]]]:
     def run(data: str, *overrides: str) -> tuple[Path, dict[str, float]]:
         folder = tmp_path_factory.mktemp("runs") / "run"
-        files = [f"data.path={photos}", f"unlabeled={photos}", f"weights={weights}"]
+        files = [f"data.path={photographs}", f"unlabeled={photographs}", f"weights={weights}"]
         files.append(f"out={folder}")
         settings = train_command.read([*SETTINGS, f"data={data}", *files, *overrides])
         return folder, completed_run(settings, folder)
@@ -71,11 +49,9 @@ def almost_fixed(tuned) -> tuple[Path, dict[str, float]]:
     return tuned("unlabeled", ALMOST_FIXED, "train.epochs=2")
 
 
-def normalized_logits(network, images, mean=IMAGENET_MEAN, std=IMAGENET_STD) -> Tensor:
-    mean_of_channel = torch.tensor(mean).view(3, 1, 1)
-    std_of_channel = torch.tensor(std).view(3, 1, 1)
+def normalized_logits(network, images) -> Tensor:
     with torch.no_grad():
-        return network.eval()((images - mean_of_channel) / std_of_channel)
+        return network.eval()(normalize(images, IMAGENET_MEAN, IMAGENET_STD))
 
 
 def load_torchvision(path: Path) -> nn.Module:
@@ -138,12 +114,14 @@ def test_of_networks_with_equal_agreement_the_last_one_is_kept(almost_fixed):
     assert scores["test/epoch"] == 2
 
 
-def test_labeled_folders_are_scored_in_a_networks_classes_before_and_after(tuned, weights, photos):
+def test_labeled_folders_are_scored_in_a_networks_classes_before_and_after(
+    tuned, weights, photographs
+):
     _, scores = tuned("folder", ALMOST_FIXED)
     assert scores["test/agreement"] == 1
     assert scores["test/accuracy"] == scores["test/accuracy_before"]
 
-    files = ["data=folder", f"data.path={photos}", f"weights={weights}", "out=-"]
+    files = ["data=folder", f"data.path={photographs}", f"weights={weights}", "out=-"]
     test = load_data(train_command.read([*SETTINGS, *files])).test
     classifier = load_classifier(f"torchvision:{NAME}", weights)
     class_of_label = torch.tensor([classifier.label("lemon"), classifier.label("orange")])

@@ -89,17 +89,6 @@ def states_after_steps(trainer: Trainer) -> list[State]:
     return states
 
 
-def signal_after_step(trainer: Trainer, step: int) -> None:
-    """Send this process SIGTERM when a step of the run, counted from 1, has been taken."""
-    states = states_after_steps(trainer)
-
-    def send(*_) -> None:
-        if len(states) == step:
-            signal.raise_signal(signal.SIGTERM)
-
-    trainer.step.optimizer.register_step_post_hook(send)
-
-
 def test_a_step_is_sgd_with_nesterov_momentum_and_decay_at_the_scheduled_rate(tmp_path):
     """Each of two epochs is one step on all images, whose order does not matter."""
     images = single_colors(12)

@@ -1,15 +1,13 @@
 """experiment=photographs learns from unlabeled photographs in the light of a projector."""
 
-from pathlib import Path
-
-import numpy as np
 import pytest
 import torch
+from torch.distributions import Categorical, kl_divergence
 
 from augment.random_streams import generator
 from renderer.image import to_unit
-from tests.helpers import save_noise
 from tests.runs import completed_run
+from tests.train.helpers import SHORT_TRAINING
 from train.__main__ import main as train_command
 from train.checkpoints import load
 from train.commands import experiment
@@ -23,47 +21,19 @@ from train.training.augmentations import Augmentation, relit
 from train.training.averages import FACTORS, INTERPOLATION, interpolate, predict
 from train.training.recipe import TrainingLoss
 
-NAME = "shufflenet_v2_x0_5"
-SIZE = 32
 GRAY = Split(torch.full((64, 3, 24, 24), 180, dtype=torch.uint8), torch.zeros(64).long())
 
 
 @pytest.fixture(scope="module")
-def photographs(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("photographs")
-    rng = np.random.default_rng(0)
-    for number in range(24):
-        dark = 150 * (number % 2)
-        save_noise(folder / f"{number}.png", rng, (40, 36), dark, dark + 100)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def small(weights, photographs) -> list[str]:
-    files = [f"network=torchvision:{NAME}", f"weights={weights}", f"unlabeled={photographs}"]
-    data = [f"size={SIZE}", "data.test_fraction=0.25", "data.validation=0.25"]
-    hardware = ["train.device=cpu", "train.precision=float32", "train.threads=1"]
-    return [*files, *data, *hardware, "train.batch_size=8"]
-
-
-@pytest.fixture(scope="module")
-def settings_of(small):
-    def read(folder, *overrides):
-        words = ["experiment=photographs", "train.epochs=2", "train.learning_rate=0.003"]
-        return train_command.read([*words, *small, f"out={folder}", *overrides])
-
-    return read
-
-
-@pytest.fixture(scope="module")
-def finished(settings_of, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("runs") / "run"
-    return folder, completed_run(settings_of(folder), folder)
+    return [*SHORT_TRAINING, f"weights={weights}", f"unlabeled={photographs}"]
 
 
 @pytest.mark.slow
-def test_the_weights_lie_on_the_line_between_original_and_trained_ones(finished, weights):
-    folder, scores = finished
+def test_the_weights_lie_on_the_line_between_original_and_trained_ones(small, weights, tmp_path):
+    words = ["experiment=photographs", "train.epochs=2", "train.learning_rate=0.003", *small]
+    folder = tmp_path / "run"
+    scores = completed_run(train_command.read([*words, f"out={folder}"]), folder)
     best = load(folder / BEST)
     factor = best[INTERPOLATION]
     assert factor in FACTORS
@@ -191,15 +161,14 @@ def test_the_loss_compares_relit_and_unchanged_images_with_the_teacher(weight):
     no_renders = torch.zeros(4, dtype=torch.bool)
     value, _ = loss.compute(unchanged, torch.zeros(4, dtype=torch.int64), no_renders, relit)
 
-    def probabilities(network, images):
-        return network(to_unit(images)).detach().softmax(1).double().numpy()
+    def predicted(network, images):
+        return Categorical(logits=network(to_unit(images)))
 
-    wanted = probabilities(teacher, unchanged)
-    divergences = []
-    for images in (unchanged, relit):
-        found = probabilities(model, images)
-        divergences.append((wanted * np.log(wanted / found)).sum(1).mean())
-    assert value.item() == pytest.approx(weight * divergences[0] + 0.5 * divergences[1], rel=1e-5)
+    wanted = predicted(teacher, unchanged)
+    distilled, consistent = (
+        kl_divergence(wanted, predicted(model, images)).mean() for images in (unchanged, relit)
+    )
+    torch.testing.assert_close(value, weight * distilled + 0.5 * consistent)
 
 
 def test_gradient_steps_lower_the_confidence_of_relit_batches():

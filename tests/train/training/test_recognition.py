@@ -10,8 +10,8 @@ import norm_balls as nb
 from augment.switch import LIT_NAME, Recognizer, statistics
 from renderer import InputError
 from renderer.image import to_unit
-from tests.helpers import save_noise
 from tests.runs import completed_run
+from tests.train.helpers import SHORT_TRAINING
 from train.__main__ import main as train_command
 from train.checkpoints import load_network
 from train.data.sets import Split
@@ -22,7 +22,7 @@ from train.training.recognition import DECAY, fit_recognizer, logistic_weights, 
 SIZE = 32
 
 
-def photographs(count: int, seed: int) -> torch.Tensor:
+def smooth_images(count: int, seed: int) -> torch.Tensor:
     """Return smooth random images, uint8, shape (count, 3, SIZE, SIZE)."""
     rng = torch.Generator().manual_seed(seed)
     coarse = 255 * torch.rand(count, 3, 4, 4, generator=rng)
@@ -97,14 +97,14 @@ def test_the_expected_errors_are_those_of_random_scores(count):
 
 def test_stripes_are_recognized_and_unchanged_images_are_not(network):
     train_split, kept_aside = (
-        Split(photographs(count, seed), torch.zeros(count).long())
+        Split(smooth_images(count, seed), torch.zeros(count).long())
         for count, seed in ((200, 0), (50, 1))
     )
     recognizes = Recognizer(
         network, **fit_recognizer(network, train_split, kept_aside, 0, "stripes")
     )
     assert not recognizes(to_unit(kept_aside.images)).any()
-    others = photographs(200, 2)
+    others = smooth_images(200, 2)
     assert recognizes(to_unit(others)).double().mean() < 0.05
     assert recognizes(to_unit(relit(others, 3, "stripes"))).double().mean() > 0.5
 
@@ -133,19 +133,15 @@ def test_layers_of_positions_and_of_windows_recognize_no_light(network):
     assert found == [f"network.{name}" for name in recognizing_layers(network, SIZE)]
 
 
-def test_a_run_gets_the_images_in_the_light_of_its_training(weights, tmp_path):
-    rng = np.random.default_rng(0)
-    for number in range(32):
-        save_noise(tmp_path / "photographs" / f"{number}.png", rng, (40, 36), 0, 250)
+def test_a_run_gets_the_images_in_the_light_of_its_training(weights, photographs, tmp_path):
     name, run = "torchvision:shufflenet_v2_x0_5", tmp_path / "run"
-    words = [f"network={name}", f"weights={weights}", f"unlabeled={tmp_path / 'photographs'}"]
-    words += [f"size={SIZE}", "train.epochs=1", "train.batch_size=8", "train.device=cpu"]
-    words += ["data.validation=0.25", "train.learning_rate=0.003", "train.precision=float32"]
-    completed_run(train_command.read(["experiment=stripes", *words, f"out={run}"]), run)
+    words = [*SHORT_TRAINING, f"weights={weights}", f"unlabeled={photographs}", f"out={run}"]
+    words += ["train.epochs=1", "train.learning_rate=0.003"]
+    completed_run(train_command.read(["experiment=stripes", *words]), run)
     plain = load_network(name, weights, size=SIZE)
     lit = nb.load_run(run)
     switched = load_network(f"{LIT_NAME}{name}+run:{run}", weights, size=SIZE)
-    images = to_unit(torch.cat([photographs(20, 5), relit(photographs(20, 6), 7, "stripes")]))
+    images = to_unit(torch.cat([smooth_images(20, 5), relit(smooth_images(20, 6), 7, "stripes")]))
     is_lit = lit.recognizer(images)
     assert 0 < is_lit.sum() < len(images)
     expected = torch.where(is_lit[:, None], lit(images), plain(images))
@@ -158,10 +154,7 @@ def test_a_run_gets_the_images_in_the_light_of_its_training(weights, tmp_path):
         lit.with_lit(plain)
 
 
-def test_a_hardened_classifier_recognizes_the_light_of_its_training(weights, tmp_path):
-    rng = np.random.default_rng(0)
-    for number in range(32):
-        save_noise(tmp_path / "photographs" / f"{number}.png", rng, (40, 36), 0, 250)
+def test_a_hardened_classifier_recognizes_the_light_of_its_training(weights, photographs, tmp_path):
     plain = load_network("torchvision:shufflenet_v2_x0_5", weights, size=SIZE)
     settings = {"recognize": True, "augmentation": "stripes", "epochs": 1, "batch_size": 8}
     settings |= {"freeze": None, "eval_mode": False, "ranking_weight": 0.0}
@@ -169,8 +162,8 @@ def test_a_hardened_classifier_recognizes_the_light_of_its_training(weights, tmp
     options |= {"data": {"validation": 0.25}, "out": tmp_path / "run"}
     for normalize_light in (None, True):
         network = plain.normalizing_light(normalize_light)
-        lit = nb.harden(network, [], tmp_path / "photographs", overwrite=True, **options)
-        images = to_unit(torch.cat([photographs(9, 5), relit(photographs(9, 6), 7, "stripes")]))
+        lit = nb.harden(network, [], photographs, overwrite=True, **options)
+        images = to_unit(torch.cat([smooth_images(9, 5), relit(smooth_images(9, 6), 7, "stripes")]))
         expected = nb.load_run(tmp_path / "run").recognizer(images)
         assert (lit.recognizer(images) == expected).all()
         switched = plain.with_lit(lit)
@@ -179,4 +172,4 @@ def test_a_hardened_classifier_recognizes_the_light_of_its_training(weights, tmp
             switched(images), torch.where(expected[:, None], lit(images), plain(images))
         )
     with pytest.raises(InputError, match=r"^train\.recognize"):
-        nb.harden(plain.network, [], tmp_path / "photographs", size=SIZE, **options)
+        nb.harden(plain.network, [], photographs, size=SIZE, **options)

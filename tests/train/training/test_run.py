@@ -21,6 +21,7 @@ from augment.tasks.classification import complementary_label
 from renderer.errors import InputError
 from tests.helpers import save_noise
 from tests.runs import completed_run, loaded_run
+from tests.train.helpers import modification_times
 from train import checkpoints, run_folder
 from train.checkpoints import load_run
 from train.command_settings import LabSettings
@@ -51,10 +52,6 @@ def weight_hashes(folder: Path) -> list[str]:
 def metrics(folder: Path) -> list[dict]:
     lines = read_metrics(folder)
     return [{name: line[name] for name in line if name[:8] != "seconds/"} for line in lines]
-
-
-def modification_times(folder: Path) -> dict[Path, int]:
-    return {path: path.stat().st_mtime_ns for path in folder.rglob("*")}
 
 
 def act_at(monkeypatch, round_number: int, step: int, act: Callable[[], None]) -> None:
