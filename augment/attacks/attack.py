@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from numbers import Integral
-from operator import itemgetter
 from typing import Any, TypeVar
 
 import torch
@@ -17,7 +16,7 @@ from augment import classifier as classifiers
 from augment.attack_settings import RANDOM_SEARCH, AttackSettings, StepSettings
 from augment.attacks.adversary import final_images
 from augment.attacks.loop import minimize
-from augment.attacks.objective import NOISE_DRAWS, Objective
+from augment.attacks.objective import NOISE_DRAWS, Images, Objective
 from augment.attacks.problem import build_problem, source_labels, warn_of_changed_light
 from augment.attacks.result import ZERO_GRADIENT, AttackResult
 from augment.classifier import UNIT_RANGE, Classifier, Normalization, TaskNetwork
@@ -31,6 +30,7 @@ from augment.tasks.classification import Classification, class_index
 from augment.tasks.task import Criterion, Task
 from renderer.errors import InputError, as_list, is_whole, require_flag, require_kind, require_whole
 from renderer.light import basis, files
+from renderer.light.basis import DEGREE
 
 # `_candidates` draws the polar angle of a camera from the range `POLAR`, in degrees, and
 # the width of the visible region from the range `WIDTH`, in world units.
@@ -54,6 +54,9 @@ EXPOSURES = (1.0, 0.5, 0.7, 1.5, 2.5, 4.0)
 # The search for a scene ends when the classifier gives the true class at least this probability
 # in all images.
 CONFIDENCE_TO_STOP = 0.5
+
+# Number of lights and exposures of a camera that the search may render again.
+RENDERED_AGAIN = 3
 
 # Target class of an attack, or one for each view.
 Target = str | int | Sequence[str | int] | None
@@ -294,17 +297,40 @@ def find_scene(
 
     The search tries several cameras. Each is tried in the light of the scene, in the built-in
     environments and in uniform light, with several exposures, and also in front of a light gray
-    background. It ends when the classifier gives the true class a probability of at least
-    `CONFIDENCE_TO_STOP` in all images. The given settings are returned if no scene is recognized.
+    background. All lights of a camera are tried in drafts, and the best ones are rendered again as
+    the attack does, until one is better than before. The search ends when the classifier gives the
+    true class a probability of at least `CONFIDENCE_TO_STOP` in all images. The given settings are
+    returned if no scene is recognized.
     """
-    # Confidence and settings. The confidence is 0 if an image is misclassified.
-    best = 0.0, settings
+    # Confidence, settings and scene. The confidence is 0 if an image is misclassified.
+    best: tuple[float, Settings, Scene | None] = 0.0, settings, None
     for candidate in progress(_candidates(settings, cameras, draws), "search for a scene"):
-        found = _best_light(build(candidate), candidate, attack_settings, classifier)
-        best = max(best, found, key=itemgetter(0))
+        draft = _draft(build(candidate))
+        for drafted, found in _best_lights(draft, candidate, attack_settings, classifier):
+            if drafted <= best[0]:
+                break
+            scene = build(found)
+            problem = build_problem(attack_settings, scene)
+            images = problem.images(problem.start)
+            exact = float(_confidences(problem.scene, images, attack_settings, classifier))
+            if exact > best[0]:
+                best = exact, found, scene
+                break
         if best[0] >= CONFIDENCE_TO_STOP:
             break
-    return best[1], build(best[1])
+    _, found, chosen = best
+    return found, build(found) if chosen is None else chosen
+
+
+def _draft(scene: Scene) -> Scene:
+    """Return a scene that takes little time for many lights, but has no shadows and bounces."""
+    settings = replace(scene.settings, shadows=False, bounces=0, silhouettes=False)
+    changes: dict[str, Any] = {"settings": settings, "one_light": False}
+    # Highlights are blurred, as far as the user did not choose the degree.
+    if scene.lights_of_degree is not None:
+        changes["basis"], lights = scene.lights_of_degree(DEGREE, None)
+        changes["lights"] = lights.to(scene.lights)
+    return scene.changed(**changes)
 
 
 def _candidates(settings: Settings, cameras: int, draws: Generator) -> Iterator[Settings]:
@@ -335,10 +361,10 @@ def _candidates(settings: Settings, cameras: int, draws: Generator) -> Iterator[
             yield replace(candidate, backgrounds=[LIGHT_GRAY])
 
 
-def _best_light(
+def _best_lights(
     scene: Scene, settings: Settings, attack_settings: AttackSettings, classifier: Classifier
-) -> tuple[float, Settings]:
-    """Return the highest confidence in a scene in any light and exposure, and its settings."""
+) -> list[tuple[float, Settings]]:
+    """Return the highest confidences in a scene in any light and exposure, and their settings."""
     degree = basis.harmonics_of(scene.basis).degree
     candidates, coefficients = [], []
     for name in dict.fromkeys([settings.light, *files.PROBES, files.UNIFORM]):
@@ -355,21 +381,27 @@ def _best_light(
     # and lamps.
     local_lights = scene.lights.repeat(count, 1, 1)[:, skies.shape[1] :]
     lights = torch.cat([skies, local_lights], dim=1)
-    scene_of_candidates = scene.changed(examples=[*scene.examples] * count, lights=lights)
-    highest, index = _confidences(scene_of_candidates, attack_settings, classifier, count).max(0)
-    return float(highest), candidates[index]
+    changed = scene.changed(examples=[*scene.examples] * count, lights=lights)
+    rows = torch.arange(len(changed), device=lights.device).split(changed.group_size)
+    images = torch.cat([changed.render(changed.conditions(some), some) for some in rows])
+    confidences = _confidences(changed, images, attack_settings, classifier, count)
+    highest, indices = confidences.topk(RENDERED_AGAIN)
+    chosen = [candidates[index] for index in indices.tolist()]
+    return list(zip(highest.tolist(), chosen, strict=True))
 
 
 @torch.no_grad()
 def _confidences(
-    scene: Scene, attack_settings: AttackSettings, classifier: Classifier, groups: int
+    scene: Scene,
+    images: Images,
+    attack_settings: AttackSettings,
+    classifier: Classifier,
+    groups: int = 1,
 ) -> Float[Tensor, " groups"]:
-    """Compute the confidence in each group of E / groups successive examples before an attack.
+    """Compute the confidence in each group of E / groups successive examples.
 
     It is the lowest probability of the true class in its images, or 0 if one is misclassified.
     """
-    problem = build_problem(attack_settings, scene)
-    images = problem.images(problem.start)
     labels = source_labels(scene, images.device, classifier)
     # The objects of all groups are at the same places.
     of_group = torch.arange(len(scene) // groups, device=images.device)

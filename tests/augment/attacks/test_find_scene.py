@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 import augment
+from augment.attack_settings import MaterialSettings
 from augment.attacks.attack import _candidates, find_scene
 from augment.random_streams import generator
 from augment.settings import SceneSettings
@@ -14,6 +15,7 @@ from augment.settings import SceneSettings
 # Settings that the search may change.
 CHANGED = ("polar", "azimuth", "width", "fov", "light", "exposure")
 LIGHTING = augment.AttackSettings(lighting=augment.StepSettings(), allow_negative=True)
+MATERIAL = augment.AttackSettings(material=MaterialSettings(), optimizer="random_search")
 Score = Callable[[Tensor], Tensor]
 
 
@@ -37,20 +39,23 @@ def built(settings: SceneSettings, shared: bool = False) -> augment.Scene:
     return augment.build_scene(meshes, 16, settings.views, **options)
 
 
-def found(score, settings, cameras=40, shared=False) -> SceneSettings:
+def found(score, settings, cameras=40, shared=False, attacked=LIGHTING) -> SceneSettings:
     build = partial(built, shared=shared)
     classifier = classifier_of(score)
-    return find_scene(classifier, settings, LIGHTING, build, cameras, generator(0))[0]
+    return find_scene(classifier, settings, attacked, build, cameras, generator(0))[0]
 
 
 @pytest.mark.parametrize("shared", [False, True])
 @pytest.mark.parametrize("settings", [SceneSettings(views=2), SceneSettings(fov=40.0)])
-def test_a_camera_and_light_are_found_in_which_all_views_are_classified_correctly(settings, shared):
-    chosen = found(bright_and_small, settings, shared=shared)
+@pytest.mark.parametrize("attacked", [LIGHTING, MATERIAL])
+def test_a_camera_and_light_are_found_in_which_all_views_are_classified_correctly(
+    settings, shared, attacked
+):
+    chosen = found(bright_and_small, settings, shared=shared, attacked=attacked)
     assert chosen != settings
     other_settings = {name: getattr(settings, name) for name in CHANGED}
     assert replace(chosen, **other_settings) == settings
-    before = replace(LIGHTING, max_steps=0)
+    before = replace(attacked, max_steps=0, max_queries=1)
     classifier = classifier_of(bright_and_small)
     result = augment.attack(classifier, built(chosen, shared), settings=before)
     assert result.clean_correct.all()
