@@ -329,9 +329,11 @@ def _read_transforms(path: Path, whole: bool) -> dict[str, PinholeCamera]:
             if not {"w", "h", "fl_x", "fl_y", "cx", "cy"} & entries.keys():
                 entries |= _size_of_image(path.parent / frame["file_path"])
             intrinsics, size = _transforms_intrinsics(entries)
+            pose = np.array(frame["transform_matrix"], dtype=float)
             # Some programs leave out the last row, which is always the same.
-            rows = np.array(frame["transform_matrix"], dtype=float)[:3]
-            view = np.linalg.inv(np.vstack([rows, [0, 0, 0, 1]]))
+            if pose.shape == (3, 4):
+                pose = np.vstack([pose, [0, 0, 0, 1]])
+            view = np.linalg.inv(pose)
             camera = PinholeCamera.from_matrix(view, intrinsics, size, "opengl", whole)
             _add(cameras, frame["file_path"], camera)
     return cameras

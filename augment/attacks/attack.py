@@ -385,9 +385,9 @@ def _best_lights(
     rows = torch.arange(len(changed), device=lights.device).split(changed.group_size)
     images = torch.cat([changed.render(changed.conditions(some), some) for some in rows])
     confidences = _confidences(changed, images, attack_settings, classifier, count)
-    highest, indices = confidences.topk(RENDERED_AGAIN)
-    chosen = [candidates[index] for index in indices.tolist()]
-    return list(zip(highest.tolist(), chosen, strict=True))
+    # Of equal confidences, that of the given light and exposure comes first.
+    order = confidences.argsort(descending=True, stable=True)[:RENDERED_AGAIN].tolist()
+    return [(float(confidences[index]), candidates[index]) for index in order]
 
 
 @torch.no_grad()

@@ -387,6 +387,10 @@ def ignored_features(tree: dict[str, Any]) -> list[str]:
 
 def _emits_its_color(material: dict[str, Any]) -> bool:
     """Whether a material is black and emits light, as Blender writes a texture without shading."""
+    extensions = {SPECULAR_GLOSSINESS, "KHR_materials_unlit"} & {*material.get("extensions", ())}
+    # Another model has a color of its own, and the opacity is that of the base color.
+    if extensions or material.get("alphaMode", "OPAQUE") != "OPAQUE":
+        return False
     base = material.get("pbrMetallicRoughness", {}).get("baseColorFactor", [1])
     return not any(base[:3]) and any(material.get("emissiveFactor", ()))
 

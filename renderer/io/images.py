@@ -27,7 +27,12 @@ from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import ExifTags, Image, ImageCms, ImageDraw, ImageFont, ImageOps
-from PIL.TiffImagePlugin import BITSPERSAMPLE, PHOTOMETRIC_INTERPRETATION, TiffImageFile
+from PIL.TiffImagePlugin import (
+    BITSPERSAMPLE,
+    PHOTOMETRIC_INTERPRETATION,
+    PLANAR_CONFIGURATION,
+    TiffImageFile,
+)
 
 from renderer.errors import InputError, keyed, reading, require_file
 from renderer.io.files import atomic_write
@@ -102,8 +107,9 @@ def identify(file: BinaryIO) -> Image.Image:
     """Return the image in a stream of bytes, without decoding its pixels."""
     image = Image.open(file, formats=FORMATS)
     # Pillow reads 16 bits as 8 if the channels of a TIFF file are stored one after the other.
-    bits = max(image.tag_v2.get(BITSPERSAMPLE, (1,))) if isinstance(image, TiffImageFile) else 8
-    if bits > 8 and "args=('R'," in str(image.tile):
+    tags = image.tag_v2 if isinstance(image, TiffImageFile) else {}
+    is_apart = tags.get(PLANAR_CONFIGURATION) == 2 and image.tile[0][0] == "raw"
+    if is_apart and max(tags.get(BITSPERSAMPLE, (1,))) > 8:
         raise ValueError("its channels of 16 bits are stored apart: save them interleaved")
     key = image.info.get("transparency")
     if image.format == "PNG" and key is not None:

@@ -270,8 +270,9 @@ def _fits_stored_image(photograph: Annotated) -> bool | None:
     # An image that cannot be read is reported when it is needed.
     with suppress(Exception), open_image(photograph.path) as image:
         stored = np.array(image.size, float)
-        is_sideways = image.getexif().get(ExifTags.Base.Orientation, 1) > 4
-        if photograph.size and is_sideways and not _is_similar(stored, stored[::-1]):
+        # The method of PNG would decode the pixels.
+        orientation = Image.Image.getexif(image).get(ExifTags.Base.Orientation, 1)
+        if photograph.size and orientation > 4 and not _is_similar(stored, stored[::-1]):
             return _is_similar(np.array(photograph.size, float), stored)
     return None
 

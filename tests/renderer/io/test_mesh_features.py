@@ -129,7 +129,7 @@ ROWS = [
     ("Kd of one number", obj(mtl="Kd 0.5"), ASSUMED),
     ("Kd and vertex colors", obj(mtl="Kd 1 1 0", vertex="0 1 1"), GREEN),
     ("map_Kd", obj(mtl="map_Kd red.png", face=TEXTURED), RED),
-    ("map_Kd and Kd", obj(mtl="map_Kd red.png\nKd 1 0 1", face=TEXTURED), RED),
+    ("map_Kd and Kd", obj(mtl="map_Kd red.png\nKd 0 1 1", face=TEXTURED), (0.0, 0.0, 0.0)),
     # As trimesh, nerfstudio and the models of YCB write them.
     *(
         (f"map_Kd, Kd {gray}", obj(mtl=f"Kd {gray}\nmap_Kd red.png", face=TEXTURED), outcome)
