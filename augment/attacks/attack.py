@@ -300,7 +300,8 @@ def find_scene(
     background. All lights of a camera are tried in drafts, and the best ones are rendered again as
     the attack does, until one is better than before. The search ends when the classifier gives the
     true class a probability of at least `CONFIDENCE_TO_STOP` in all images. The given settings are
-    returned if no scene is recognized.
+    returned if no scene is recognized. Shadows and bounces are missing in drafts, so that a scene
+    that is recognized only with them is not found.
     """
     # Confidence, settings and scene. The confidence is 0 if an image is misclassified.
     best: tuple[float, Settings, Scene | None] = 0.0, settings, None

@@ -269,9 +269,11 @@ def _fits_stored_image(photograph: Annotated) -> bool | None:
     """Whether boxes are those of an image as it is stored. None if its aspect ratio cannot tell."""
     # An image that cannot be read is reported when it is needed.
     with suppress(Exception), open_image(photograph.path) as image:
-        stored = np.array(image.size, float)
         # The method of PNG would decode the pixels.
         orientation = Image.Image.getexif(image).get(ExifTags.Base.Orientation, 1)
+        # Pillow tells the size of a TIFF file as it is after the turn.
+        is_turned = image.format == "TIFF" and orientation > 4
+        stored = np.array(image.size[::-1] if is_turned else image.size, float)
         if photograph.size and orientation > 4 and not _is_similar(stored, stored[::-1]):
             return _is_similar(np.array(photograph.size, float), stored)
     return None
@@ -353,7 +355,11 @@ def _read_yolo(folder: Path, file: Path | None = None) -> Annotations:
         raise InputError(f"{fault}: add some, such as {first}", "photos")
     if repeated_count := sum(read.values()):
         console.warning("%s: %d lines that repeat another are left out", folder, repeated_count)
-    missing += _labels_without_image(photographs, [*read])
+    # Text files that the YAML file names are lists of images.
+    content = _yaml_mapping(named) if named.suffix.lower() in YAML else {}
+    lists = str([content.get(key) for key in ("train", "val", "test")])
+    unused = _labels_without_image(photographs, [*read])
+    missing += [file for file in unused if Path(file).name not in lists]
     return Annotations(folder, photographs, classes, missing)
 
 
@@ -411,7 +417,7 @@ def _validation_images(file: Path) -> list[Path]:
             found += [path / item.path for item in find_unlabeled(path)]
     if given and not found:
         raise InputError(f"{file} has no image of its entry val: {given}", "photos")
-    return found
+    return [*dict.fromkeys(found)]
 
 
 def _lines(file: Path) -> list[str]:

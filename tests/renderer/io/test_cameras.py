@@ -73,6 +73,17 @@ def require_expected(path: Path, focal_y: float = FOCAL_Y) -> None:
         np.testing.assert_allclose(found, expected_positions(view, focal_y), atol=1e-9)
 
 
+def test_a_transposed_matrix_is_refused(tmp_path):
+    write_transforms(tmp_path / "transforms.json", fl_x=FOCAL_X, fl_y=FOCAL_Y)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    matrix = np.array(content["frames"][0]["transform_matrix"])
+    matrix = np.vstack([matrix, [0, 0, 0, 1]])[:4]
+    content["frames"][0]["transform_matrix"] = matrix.T.tolist()
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="rotation"):
+        renderer.load_cameras(tmp_path / "transforms.json")
+
+
 @pytest.mark.parametrize(
     "points",
     [

@@ -554,6 +554,21 @@ def test_a_texture_that_is_shown_without_shading_is_the_color(tmp_path):
     assert_allclose(linear(mesh.corner_colors), np.broadcast_to([1, 1, 0.5], (2, 3, 3)), atol=1e-6)
 
 
+@pytest.mark.parametrize(
+    "entries",
+    [
+        {"alphaMode": "MASK"},
+        {"extensions": {"KHR_materials_unlit": {}}},
+        {"extensions": {"KHR_materials_pbrSpecularGlossiness": {"diffuseFactor": [0, 0, 0, 1]}}},
+    ],
+)
+def test_the_emission_is_no_color_beside_an_opacity_or_another_model(tmp_path, entries):
+    black = {"baseColorFactor": [0, 0, 0, 1]}
+    gltf = Gltf().square(pbrMetallicRoughness=black, emissiveFactor=[1, 1, 1], **entries)
+    with pytest.warns(UserWarning, match="emitted light"):
+        assert not gltf.load(tmp_path).corner_colors.any()
+
+
 def changed(kind: str, **entries: Any) -> Gltf:
     gltf = plain()
     gltf.tree[kind][0] |= entries

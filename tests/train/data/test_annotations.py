@@ -114,9 +114,10 @@ def test_all_boxes_of_a_file_are_turned_if_one_photograph_on_its_side_shows_it(
     """A program that ignores the orientation of one photograph ignores that of all."""
     _draw(tmp_path / "a.png", orientation=6)
     _draw(tmp_path / "b.png", orientation=orientation)
-    _write_coco(tmp_path / "a.json", ["a.png", "b.png"])
+    _draw(tmp_path / "c.tif", orientation=6)
+    _write_coco(tmp_path / "a.json", ["a.png", "b.png", "c.tif"])
     photographs = read_annotations(tmp_path).photographs
-    for photograph, size in zip(photographs, [(80, 40), (40, 80)], strict=True):
+    for photograph, size in zip(photographs, [(80, 40), (40, 80), (80, 40)], strict=True):
         fitted = fit(photograph, size, STRETCH)
         assert fitted.boxes[0].tolist() == _bounds(fitted.pixels[0])
 
@@ -272,7 +273,7 @@ def test_missing_images_of_val_are_counted_and_a_val_without_images_is_refused(t
     (tmp_path / "data.yaml").write_text("{names: [cat], val: val.txt}")
     read = read_annotations(tmp_path)
     assert [item.name for item in read.photographs] == ["a.png"]
-    assert str(tmp_path / "b.png") in read.missing
+    assert read.missing == [str(tmp_path / "b.png")]
     for place in ("elsewhere", "[elsewhere, val.txt]"):
         (tmp_path / "data.yaml").write_text(f"{{names: [cat], val: {place}}}")
         (tmp_path / "val.txt").write_text("b.png\n")
