@@ -327,7 +327,7 @@ def _draft(scene: Scene) -> Scene:
     """Return a scene that takes little time for many lights, but has no shadows and bounces."""
     settings = replace(scene.settings, shadows=False, bounces=0, silhouettes=False)
     changes: dict[str, Any] = {"settings": settings, "one_light": False}
-    # Highlights are blurred, as far as the user did not choose the degree.
+    # Unless the user chose the degree, the light has degree 6, which blurs highlights.
     if scene.lights_of_degree is not None:
         changes["basis"], lights = scene.lights_of_degree(DEGREE, None)
         changes["lights"] = lights.to(scene.lights)

@@ -5,7 +5,7 @@ A photograph is shown upright, as its EXIF orientation says, and brought to the 
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -326,14 +326,13 @@ def _read_yolo(folder: Path, file: Path | None = None) -> Annotations:
     """
     classes, named = _yolo_classes(folder, file)
     # Labels of poses have keypoints after the box.
-    has_keypoints = named.suffix.lower() in YAML and "kpt_shape" in _yaml_mapping(named)
-    paths = _validation_images(named) if named.parent == folder else []
+    content = _yaml_mapping(named) if named.suffix.lower() in YAML else {}
+    has_keypoints = "kpt_shape" in content
+    paths = _validation_images(named, content) if named.parent == folder else []
     missing = [str(path) for path in paths if not path.is_file()]
     if paths:
         console.info("%s: the images of its entry val are read", named)
         paths = [path for path in paths if path.is_file()]
-        if not paths:
-            raise InputError(f"{named} has no image of its entry val: the first is {missing[0]}")
     photographs = []
     # Label files that exist, and the number of their lines that repeat another.
     read: dict[Path, int] = {}
@@ -356,7 +355,6 @@ def _read_yolo(folder: Path, file: Path | None = None) -> Annotations:
     if repeated_count := sum(read.values()):
         console.warning("%s: %d lines that repeat another are left out", folder, repeated_count)
     # Text files that the YAML file names are lists of images.
-    content = _yaml_mapping(named) if named.suffix.lower() in YAML else {}
     lists = str([content.get(key) for key in ("train", "val", "test")])
     unused = _labels_without_image(photographs, [*read])
     missing += [file for file in unused if Path(file).name not in lists]
@@ -393,13 +391,12 @@ def _yaml_mapping(file: Path) -> dict[str, Any]:
     return content if isinstance(content, dict) else {}
 
 
-def _validation_images(file: Path) -> list[Path]:
-    """List the images of the entry `val` of a YAML file, as Ultralytics finds them.
+def _validation_images(file: Path, content: Mapping[str, Any]) -> list[Path]:
+    """List the images of the entry `val` in the content of a YAML file, as Ultralytics does.
 
-    The entry is a folder, a file with the path of an image on each line, or a list of these. Empty
-    without images.
+    The entry is a folder, a file with the path of an image on each line, or a list of these. Some
+    paths of such a file may be missing. The result is empty without the entry.
     """
-    content = _yaml_mapping(file) if file.suffix.lower() in YAML else {}
     given = content.get("val") or []
     if not isinstance(given, str | list):
         raise InputError(f"{file} has val: {given}: give folders or text files", "photos")
@@ -415,7 +412,7 @@ def _validation_images(file: Path) -> list[Path]:
             found += [path.parent / line for line in _lines(path)]
         else:
             found += [path / item.path for item in find_unlabeled(path)]
-    if given and not found:
+    if given and not any(map(Path.is_file, found)):
         raise InputError(f"{file} has no image of its entry val: {given}", "photos")
     return [*dict.fromkeys(found)]
 
