@@ -19,6 +19,7 @@ from augment.attacks.problem import SceneProblem, source_labels
 from augment.augmentation_settings import AugmentationSettings
 from augment.classifier import TaskNetwork
 from augment.progress import Phases
+from augment.random_streams import generator
 from augment.scene.build import MeshItem, build_scene, warn_of_exposure
 from augment.scene.objects import SceneObject
 from augment.scene.render import KEPT_SAMPLES
@@ -33,6 +34,8 @@ from renderer.settings import Size, height_and_width
 # Renders with consecutive indices are drawn together. Larger blocks would render more than
 # is asked for, smaller ones would prepare scenes more often.
 BLOCK = 32
+# Passes in which a perspective camera is fitted to several objects.
+FITTING_STEPS = 8
 # Labels of objects without a class.
 NAMELESS = ("", NO_OBJECT)
 
@@ -91,12 +94,13 @@ def render_dataset(
 ) -> Iterator[LabeledRender]:
     """Render labeled images one after another.
 
-    The renders show the entries of `meshes` in turn, then the next background,
-    then the next view. `width` of the scene is that of the shorter side, at all
-    objects of an entry, which together span [-1, 1]. What else differs is
-    drawn at random, as `settings.vary` and `settings.random_light` say. A render
-    with an index is the same whatever `first` and `count` are, so that several
-    processes can share the work.
+    The renders show the entries of `meshes` in turn. The pairs of a view and a
+    background of each entry come in random order, and all before one comes
+    again. `width` of the scene is that of the shorter side, at all objects of an
+    entry, which together span [-1, 1]. What else differs is drawn at random, as
+    `settings.vary` and `settings.random_light` say. A render with an index is the
+    same whatever `first` and `count` are, so that several processes can share
+    the work.
 
     Args:
         meshes: Entries of `build_scene`: pairs of a mesh and its class, or lists
@@ -168,8 +172,10 @@ def _render_blocks(
     if network is not None:
         of_network = {"task": network.task, "classes": network.classes}
     # The examples of the scene are sorted by object, view and background.
-    shape = (len(scene.objects), -1, len(scene.backgrounds))
-    in_turn = torch.arange(len(scene)).view(shape).permute(1, 2, 0).flatten().tolist()
+    of_objects = torch.arange(len(scene)).view(len(scene.objects), -1)
+    # In random order, so that each part of a data set shows all sides of the objects.
+    order = torch.randperm(of_objects.shape[1], generator=generator(seed, "order"))
+    in_turn = of_objects[:, order].T.flatten().tolist()
     for block, members in groupby(indices, lambda index: index // BLOCK):
         # The whole block is prepared even if few of its renders are needed, so that the random
         # numbers of a render do not depend on the others.
@@ -206,12 +212,17 @@ def _show_all(camera: Camera, item: SceneObject, size: Size) -> Camera:
     camera = camera.widened(aspect).widened(span)
     if not item.others:
         return camera
-    # Positions in the image in units of half its width. Shift the camera to their center.
-    seen = camera.project(points)[:, :2]
-    right, up = ((seen.min(0) + seen.max(0)) / 2 * camera.width / 2).tolist()
-    # Near objects are larger in perspective.
-    wider = camera.width * max(1.0, float((np.ptp(seen, axis=0) * [1, aspect]).max()) / 2)
-    return replace(camera, right=camera.right - right, up=camera.up - up, width=wider)
+    # Near objects are larger in perspective, and a camera that moves sees them at other places.
+    for _ in range(FITTING_STEPS if camera.has_perspective else 1):
+        # Positions in the image in units of half its width. Shift the camera to their center, by
+        # less if near objects then move by more.
+        seen = camera.project(points)[:, :2]
+        depths = camera.depths(points)
+        nearest = 1.0 if depths is None else min(1.0, depths.min() / camera.distance)
+        right, up = ((seen.min(0) + seen.max(0)) / 4 * camera.width * nearest).tolist()
+        camera = replace(camera, right=camera.right - right, up=camera.up - up)
+        camera = camera.widened(max(1.0, float((np.ptp(seen, axis=0) * [1, aspect]).max()) / 2))
+    return camera
 
 
 def _renders(

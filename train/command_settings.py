@@ -368,7 +368,7 @@ class FitSettings(Settings):
 class RenderSettings(TaskSettings):
     """Settings of the command pnb-render, which writes labeled renders as a data set.
 
-    The renders show the meshes in turn, then the next background, then the next view.
+    The renders show the meshes in turn, and their views and backgrounds in random order.
     """
 
     network: str | None = setting(None, f"Network that each render shall fool: {NETWORKS}.")

@@ -1,5 +1,7 @@
 import json
+import math
 import tarfile
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -127,9 +129,25 @@ def test_without_maps_the_pictures_are_the_same(meshes, written, tmp_path):
 def test_views_of_one_light_each_are_shaded_as_operators_shade_them(meshes):
     # Two views in a block of four renders are shaded directly, and one view has an operator.
     ball = [(meshes[1]["mesh"], "ball")]
-    [direct], [operator] = (render_dataset(ball, 24, 1, views=views, fov=30.0) for views in (2, 1))
+    [direct], [operator] = (
+        render_dataset(ball, 24, 1, views=views, fov=30.0, seed=1) for views in (2, 1)
+    )
     assert (direct.image.int() - operator.image.int()).abs().max() <= 1
     assert torch.equal(direct.masks, operator.masks)
+
+
+def test_every_tenth_of_a_data_set_shows_all_sides_of_the_objects(meshes):
+    """Twelve views in front of five backgrounds: each tenth has six pairs of them."""
+    ball = [(meshes[1]["mesh"], "ball")]
+    backgrounds = [0.1, 0.3, 0.5, 0.7, 0.9]
+    of_scene = {"views": 12, "backgrounds": backgrounds, "exposure": 1.0}
+    renders = list(render_dataset(ball, 8, 60, maps=False, **of_scene))
+    # Direction from the object to the camera.
+    backs = [tuple(np.round(np.array(render.camera["pose"])[:3, 2], 6)) for render in renders]
+    assert Counter(Counter(backs).values()) == {5: 12}
+    tenths = [{*backs[start : start + 6]} for start in range(0, 60, 6)]
+    assert min(map(len, tenths)) >= 3
+    assert max(np.linalg.norm(np.mean(list(tenth), axis=0)[:2]) for tenth in tenths) < 0.6
 
 
 def test_masks_are_found_for_all_renders_of_a_block_together(meshes, monkeypatch):
@@ -319,13 +337,15 @@ def test_ultralytics_reads_boxes_and_classes(groups, tmp_path, splits):
         assert np.allclose(np.stack(corners, 1) * [32, 20, 32, 20], expected, atol=1e-3)
 
 
-@pytest.mark.parametrize("size", [[24, 40], [40, 24]])
-def test_all_objects_of_an_entry_are_in_the_image(meshes, size):
+@pytest.mark.parametrize(("size", "fov"), [([24, 40], 30.0), ([40, 24], 30.0), ([40, 24], 60.0)])
+def test_all_objects_of_an_entry_are_in_the_image_at_the_given_field_of_view(meshes, size, fov):
     box, ball = ((item["mesh"], item["label"]) for item in meshes)
     entries = [[box, ball], [ball, box, box], ball]
-    for render in render_dataset(entries, size, 6, fov=30.0, views=2, width=2.4):
+    for render in render_dataset(entries, size, 6, fov=fov, views=2, width=3.2):
         left, top, right, bottom = render.boxes.T
         height, width = size
+        half_angle = math.atan(width / 2 / render.camera["fx"])
+        assert 2 * math.degrees(half_angle) == pytest.approx(fov)
         assert min(left.min(), top.min()) > 0
         assert right.max() < width and bottom.max() < height
         # Their center is that of the image.
