@@ -419,8 +419,12 @@ def _warn_of_wrong_irradiance(name: str, light: Tensor, degree: int) -> None:
 
 
 def _shown_material(attack: AttackSettings | None, has_detail: bool) -> MaterialSettings | None:
-    """Return the material that an attack changes, or None if its highlights show no more detail."""
-    if attack and (has_detail or attack.lighting or attack.skylight):
+    """Return the material for whose highlights the degree of the lighting is chosen, if any.
+
+    Light without detail shows no more of them at a higher degree. Attacked light keeps its degree,
+    because each step makes it nonnegative, which takes seconds at degree 25.
+    """
+    if attack and not attack.lighting and (has_detail or attack.skylight):
         return attack.material
     return None
 
@@ -432,7 +436,8 @@ def with_needed_degree(
 
     Attacks and variations may make surfaces smoother, so that their highlights
     need a higher degree. Only a degree that `build_scene` chose is raised. If
-    the user gave the degree or the coefficients, a warning is given instead.
+    the user gave the degree or the coefficients, or if the attack changes them,
+    a warning is given instead.
     """
     degree = harmonics_of(scene.basis).degree
     # If the coefficients of the highest degree are zero, the lighting is so smooth that a higher
@@ -440,9 +445,7 @@ def with_needed_degree(
     has_detail = bool(scene.lights[:, degree**2 : (degree + 1) ** 2].any())
     smoothest = reached_gloss(scene.objects, _shown_material(attack, has_detail), layer)
     needed = smoothest.affordable_degree(len(scene) * scene.views * scene.settings.pixel_count)
-    if needed <= degree:
-        return scene
-    if scene.lights_of_degree is not None:
+    if needed > degree and scene.lights_of_degree is not None:
         # Lighting that was changed after `build_scene` cannot be loaded again with another
         # degree. Compare the lighting of the scene with what `build_scene` loaded.
         _, built = scene.lights_of_degree(degree, reached_gloss(scene.objects).gloss_roughness)
@@ -451,8 +454,9 @@ def with_needed_degree(
             smoothest.warn(f"degree={degree} takes less time, but")
             basis, lights = scene.lights_of_degree(needed, smoothest.gloss_roughness)
             return scene.changed(basis=basis, lights=lights.to(scene.lights))
-    if has_detail:
-        smoothest.warn(f"degree={degree}")
+    reached = reached_gloss(scene.objects, attack.material, layer)
+    if reached.degree > degree and (has_detail or attack.lighting):
+        reached.warn(f"degree={degree}")
     return scene
 
 

@@ -10,10 +10,16 @@ import torch
 from torch import Tensor
 
 import augment
-from augment.attack_settings import MaterialSettings
+from augment.attack_settings import MaterialSettings, SkylightSettings
 from augment.attacks.parameters import make_parameter
 from augment.augmentation_settings import SpecularLayerSettings, VariationSettings
-from augment.scene.build import Smoothest, build_scene, degree_of_scene, reached_gloss
+from augment.scene.build import (
+    Smoothest,
+    build_scene,
+    degree_of_scene,
+    reached_gloss,
+    with_needed_degree,
+)
 from augment.scene.scene import Scene
 from augment.scene.vary import vary
 from augment.settings import ObjectSettings
@@ -28,10 +34,10 @@ from tests.helpers import images_of
 
 MATTE = ("solid:pear", "pear")
 OPTIONS = {"samples": 1, "rasterizer": "numpy"}
-# An attack without a radius reaches a roughness of 0.2. Attacked light gets detail of any degree.
+# An attack without a radius reaches a roughness of 0.2. An attacked sky has detail of any degree.
 UNLIMITED = MaterialSettings()
-LIGHTING = augment.StepSettings()
-ON_UNLIMITED_MATERIAL = augment.AttackSettings(material=UNLIMITED, lighting=LIGHTING)
+LIGHTING, SKY = augment.StepSettings(), SkylightSettings()
+ON_UNLIMITED_MATERIAL = augment.AttackSettings(material=UNLIMITED, skylight=SKY)
 
 
 def recorded(build: Callable, *arguments, **options) -> tuple[Any, str]:
@@ -62,7 +68,7 @@ def test_the_degree_shows_the_least_roughness_that_an_attack_on_material_reaches
     roughness = torch.full((len(mesh.faces),), 0.6)
     roughness[:9] = smoothest
     settings = MaterialSettings(radius=radius)
-    attack = augment.AttackSettings(material=settings, lighting=LIGHTING)
+    attack = augment.AttackSettings(material=settings, skylight=SKY)
     scene, told = scene_of((Gloss(roughness).on(mesh), "pear"), attack=attack)
     expected = required_degree(lowest_roughness(scene, settings))
     assert scene.basis == Harmonics(max(6, expected))
@@ -174,6 +180,14 @@ def test_an_attack_keeps_the_degree_or_the_light_that_was_given(map_name):
     scene, _ = scene_of(MATTE, light=0.9 * load_light(map_name))
     shown, _ = attacked_scene(scene, ON_MATERIAL)
     assert shown.basis == Harmonics(6)
+
+
+def test_attacked_light_keeps_its_degree_and_tells_which_one_the_gloss_would_take():
+    attack = augment.AttackSettings(material=UNLIMITED, lighting=LIGHTING)
+    scene, _ = scene_of(MATTE, attack=attack)
+    shown, told = recorded(with_needed_degree, scene, attack)
+    assert shown.basis == Harmonics(6)
+    assert f"takes light of degree {required_degree(0.2)}: degree=6" in told
 
 
 def test_degree_0_is_exact_for_even_light():
