@@ -282,6 +282,12 @@ class LocalBasis(Basis):
             differentiable with respect to all arguments.
         """
 
+    def arriving(
+        self, light: Float[Tensor, "K C"], paths: LightPaths, points: Float[Tensor, "S 3"]
+    ) -> Float[Tensor, "E C"]:
+        """Return the coefficient of the light on each path to a surface point."""
+        return light[paths.function]
+
     @abstractmethod
     def mitsuba_emitters(self, coefficients: Tensor, albedo_scale: float) -> list[dict[str, Any]]:
         """Create the descriptions of emitters with the same light for the renderer Mitsuba.

@@ -122,16 +122,8 @@ class Projector(Settings, LocalBasis):
             One path for each point that lies within the pattern and faces the
             projector, also if an object blocks the path.
         """
-        # Axes of the pattern, one for each row: right, up and back (away from the origin). A
-        # camera at the position of the projector has the same axes.
-        axes = torch.from_numpy(OrthographicCamera(self.polar, self.azimuth, 1.0).axes()).to(points)
-        source = self.distance * axes[2]
-        right, up, back = ((points - source) @ axes.T).unbind(1)
-        depth = -back
-        # Half the width of the pattern on a screen at distance 1 from the projector.
-        half_width = math.tan(math.radians(self.fov) / 2)
-        column = ((1 + right / (depth * half_width)) / 2 * self.pixels).floor()
-        row = ((1 - up / (depth * half_width)) / 2 * self.pixels).floor()
+        source, depth, places = self._seen(points)
+        row, column = places.floor()
         # Cosine between path and normal, divided by the cosine between path and axis.
         cosine_ratio = ((source - points) * normals).sum(1) / depth
         in_rows = (row >= 0) & (row < self.pixels)
@@ -142,6 +134,33 @@ class Projector(Settings, LocalBasis):
         pattern_pixel = (row * self.pixels + column)[lit_point].long()
         sources = source.expand(len(lit_point), 3)
         return LightPaths(lit_point, pattern_pixel, sources, irradiance[lit_point])
+
+    def _seen(self, points: Float[Tensor, "N 3"]) -> tuple[Tensor, Tensor, Float[Tensor, "2 N"]]:
+        """Return the projector's position, the depth of points, and their row and column."""
+        # Axes of the pattern, one for each row: right, up and back (away from the origin). A
+        # camera at the position of the projector has the same axes.
+        axes = torch.from_numpy(OrthographicCamera(self.polar, self.azimuth, 1.0).axes()).to(points)
+        source = self.distance * axes[2]
+        right, up, back = ((points - source) @ axes.T).unbind(1)
+        # Half the width of the pattern at the depth of each point.
+        half_width = -back * math.tan(math.radians(self.fov) / 2)
+        places = (1 + torch.stack([-up, right]) / half_width) / 2 * self.pixels
+        return source, -back, places
+
+    def arriving(self, light: Tensor, paths: LightPaths, points: Tensor) -> Tensor:
+        """Return the pixel of each path, whose gradient follows the pattern as points move.
+
+        The slope of the pattern is that between both neighbors of a pixel.
+        """
+        arriving = light[paths.function]
+        if not points.requires_grad or self.pixels == 1:
+            return arriving
+        _, _, places = self._seen(points[paths.point])
+        pattern = light.detach().view(self.pixels, self.pixels, -1)
+        for place, slope in zip(places, torch.gradient(pattern, dim=(0, 1)), strict=True):
+            moved = place - place.detach()
+            arriving = arriving + slope.flatten(0, 1)[paths.function] * moved[:, None]
+        return arriving
 
     def mitsuba_emitters(self, coefficients: Tensor, albedo_scale: float) -> list[dict[str, Any]]:
         """Create the entry of the projector in a Mitsuba scene.

@@ -501,7 +501,8 @@ class LocalLightView:
             seen = replace(surface.fragments, cameras=shown.cameras)
             surface = replace(surface, fragments=seen)
         # Irradiance at the end of each path: one row for each path, one column for each color.
-        irradiance = paths.irradiance[:, None] * light.cpu().double()[paths.function]
+        arriving = basis.arriving(light.cpu().double(), paths, surface.points)
+        irradiance = paths.irradiance[:, None] * arriving
         radiance = path_reflectance(surface, albedo.cpu().double(), paths) / shown.samples**2
         radiance = radiance * irradiance
         zeros = radiance.new_zeros(len(shown.pixels), 3)

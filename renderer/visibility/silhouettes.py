@@ -20,8 +20,7 @@ samples. A line with unit normal n that moves by v moves along a row by n · v /
 Crossings with rows have the weight n_x², and crossings with columns the weight
 n_y². All crossings of a line together then have its length as their weight.
 
-The light is fixed: edges of shadows and of projected patterns stay on the
-surface on which they lie.
+Edges of shadows stay on the surface on which they lie.
 
 Shapes use these letters: a view has S covered samples in P pixels, s² samples
 per pixel, and shows G faces. The mesh has V vertices and F faces. Homogeneous

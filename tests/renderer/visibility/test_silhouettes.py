@@ -16,7 +16,7 @@ from torch.autograd.functional import jacobian
 import renderer
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.light.files import ambient, load_light
-from renderer.light.lamps import Lamps
+from renderer.light.lamps import Lamps, Projector
 from renderer.mesh import concatenate
 from renderer.pinhole import PinholeCamera
 from renderer.solids import SOLIDS
@@ -106,6 +106,23 @@ def displacements(points: Tensor) -> Tensor:
     shear = torch.stack([points[:, 2], torch.zeros_like(points[:, 0]), points[:, 0]], dim=1)
     waves = [torch.sin(points[:, [1, 2, 0]] * k + k) for k in (2.0, 3.0)]
     return torch.stack([points, *turns, shear, *waves])
+
+
+@pytest.mark.parametrize("camera", [FAR, TURNED])
+def test_the_pattern_of_a_projector_stays_in_place_while_an_object_moves_through_it(camera):
+    """The ramp of 64 pixels is wider than the ball."""
+    ramp = torch.linspace(0.2, 0.8, 64).double().expand(3, 64, 64)
+    beamer = Projector(pixels=64, polar=50.0, azimuth=60.0, distance=3.0, fov=50.0)
+    mesh = named_mesh("orange")
+    points = torch.from_numpy(mesh.vertices)
+
+    def image(change: Tensor, samples: int) -> Tensor:
+        options = {"lights": [(beamer, ramp.flatten(1).T)], "light": None}
+        options["silhouettes"] = change.requires_grad
+        return rendered(mesh, camera, 32, samples, vertices=points + change, **options)
+
+    directions = displacements(points)
+    require_differences(image, directions, 6, 16, step=0.02, bound=0.03)
 
 
 # Walls of the cup and of the plate are a few samples thick.
