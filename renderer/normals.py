@@ -264,7 +264,7 @@ def normal_groups(
         by_crease = _joined(faces, first[is_smooth], second[is_smooth])
     groups = by_crease
     if file_normals is not None:
-        by_file, is_given = _groups_of_file(faces, file_normals, first, second)
+        by_file, is_given = _groups_of_file(faces, unit_normals, file_normals, first, second)
         # Groups by crease have numbers behind those of the groups of the file.
         groups = np.where(is_given, by_file, by_crease + by_file.max() + 1)
     separate = np.arange(faces.size).reshape(-1, 3)
@@ -282,17 +282,25 @@ def normal_groups(
 
 
 def _groups_of_file(
-    faces: np.ndarray, file_normals: np.ndarray, first: np.ndarray, second: np.ndarray
+    faces: np.ndarray,
+    face_normals: np.ndarray,
+    file_normals: np.ndarray,
+    first: np.ndarray,
+    second: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Group corners by their normals in a file, and tell which corners have one, shape (F, 3) each.
 
     `first` and `second` are the corners of neighboring faces (see `_neighbors`). Corners of faces
-    that only touch at a vertex are compared, too, in the order of their normals.
+    that only touch at a vertex are compared, too, in the order of their normals. Faces of opposite
+    winding are in different groups, because their area vectors would cancel.
     """
     lengths = np.linalg.norm(file_normals.astype(np.float64), axis=-1)
     is_given = (lengths > 0) & np.isfinite(lengths)
     unit_normals = np.where(is_given[..., None], file_normals, 0)
-    unit_normals = (unit_normals / np.where(is_given, lengths, 1)[..., None]).reshape(-1, 3)
+    unit_normals = unit_normals / np.where(is_given, lengths, 1)[..., None]
+    # 1 if the normal of the file is on the side of the face normal, and -1 on the other side.
+    side = np.sign(np.einsum("fci,fi->fc", unit_normals, face_normals)).ravel()
+    unit_normals = unit_normals.reshape(-1, 3)
     vertex = faces.ravel()
     # One integer is sorted much faster than four numbers.
     rounded = np.rint(1000 * unit_normals).astype(int)
@@ -303,7 +311,7 @@ def _groups_of_file(
     first = np.concatenate([first, order[:-1][is_same_vertex]])
     second = np.concatenate([second, order[1:][is_same_vertex]])
     cosines = np.einsum("ni,ni->n", unit_normals[first], unit_normals[second])
-    agree = cosines >= np.cos(np.radians(FILE_ANGLE))
+    agree = (cosines >= np.cos(np.radians(FILE_ANGLE))) & (side[first] * side[second] >= 0)
     return _joined(faces, first[agree], second[agree]), is_given
 
 

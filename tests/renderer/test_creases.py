@@ -119,6 +119,19 @@ def test_normals_of_a_file_decide_where_they_are_given():
         assert is_same_partition(ids, normal_groups(box.vertices, box.faces))
 
 
+def test_faces_that_a_file_winds_the_other_way_keep_its_normals():
+    """A tenth of the faces of a ball is turned around. The normals of the file stay those of it."""
+    ball = trimesh.creation.icosphere(3)
+    turned = np.random.default_rng(0).random(len(ball.faces)) < 0.1
+    faces = np.where(turned[:, None], ball.faces[:, ::-1], ball.faces)
+    ids = normal_groups(ball.vertices, faces, ball.vertices[faces])
+    mesh = replace(nb.Mesh.plain(ball.vertices, faces), normal_ids=ids)
+    cosines = (mesh.corner_normals * ball.vertices[faces]).sum(-1) * np.where(turned, -1, 1)[
+        :, None
+    ]
+    assert cosines.min() > np.cos(np.radians(6))
+
+
 @pytest.mark.parametrize("noise", [1e-7, 1e-4, 5e-3])
 def test_normals_of_a_file_may_be_rounded(noise):
     ball = trimesh.creation.icosphere(3)
