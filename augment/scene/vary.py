@@ -21,7 +21,7 @@ from augment.scene.tabletop import Room, above_table, irradiance, project_along_
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
 from renderer.image import clamp, decode, encode
-from renderer.io.images import SUFFIXES, read_image
+from renderer.io.images import SUFFIXES, is_hidden, read_image
 from renderer.light.basis import harmonics_of, split_light
 from renderer.light.files import directional, load_light
 from renderer.light.harmonics import degree_of
@@ -453,7 +453,9 @@ def _draw_image_files(
     folder: str | Path, key: str, count: int, size: Size, draws: Generator
 ) -> Float[Tensor, "count 3 height width"]:
     """Read randomly chosen images of a folder, with replacement."""
-    files = sorted(path for path in Path(folder).rglob("*") if path.suffix.lower() in SUFFIXES)
+    paths = (path.relative_to(folder) for path in Path(folder).rglob("*"))
+    names = sorted(path for path in paths if not any(map(is_hidden, path.parts)))
+    files = [Path(folder, name) for name in names if name.suffix.lower() in SUFFIXES]
     if not files:
         raise InputError(f"{key}={folder} has no images: give a folder of .jpg or .png files")
     chosen = torch.randint(len(files), (count,), generator=draws).tolist()

@@ -524,8 +524,9 @@ def _torchvision_count(network: Any) -> int | None:
     if not _is_of_torchvision(raw):
         return None
     # Heads of one stage store the number. Heads of two stages have a layer `cls_score` of so many
-    # outputs.
-    for module in raw.modules():
+    # outputs. A backbone may store its own number.
+    heads = (child for name, child in raw.named_children() if name != "backbone")
+    for module in (module for head in heads for module in head.modules()):
         for name in ("num_classes", "num_columns"):
             if isinstance(getattr(module, name, None), int):
                 return int(getattr(module, name))

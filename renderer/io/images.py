@@ -57,6 +57,11 @@ MIN_DECODED_RATIO = 16
 MAX_STEP = 4
 
 
+def is_hidden(name: str) -> bool:
+    """Return whether a file or folder is hidden, or was added by macOS."""
+    return name.startswith(".") or name == "__MACOSX"
+
+
 def read_image(path: str | Path, size: Size) -> Float[Tensor, "3 height width"]:
     """Read the center of an image file, in the shape of `size`, as RGB values in [0, 1]."""
     with reading(path, "cannot be read as an image"):

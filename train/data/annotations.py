@@ -21,9 +21,9 @@ from PIL import ExifTags, Image
 
 from augment.settings import NO_CLASS_PIXEL
 from renderer.errors import InputError, explained
-from renderer.io.images import SUFFIXES, gray_factor, open_image, read_rgb
+from renderer.io.images import SUFFIXES, gray_factor, is_hidden, open_image, read_rgb
 from train import console
-from train.data.photographs import find_unlabeled, is_hidden, visible_files
+from train.data.photographs import find_unlabeled, visible_files
 
 # Ways to bring a photograph to the size of a network.
 LETTERBOX = "letterbox"

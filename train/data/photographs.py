@@ -18,7 +18,7 @@ from augment.network import say_once
 from augment.progress import progress
 from augment.tasks.classification import class_index, nearest
 from renderer.errors import InputError, composed, explained, require_memory
-from renderer.io.images import SUFFIXES, read_center
+from renderer.io.images import SUFFIXES, is_hidden, read_center
 from renderer.settings import Size, height_and_width
 from train.data.photo import DESCRIPTION, TABLE, Photograph, split_sources
 from train.settings import OTHER_PREFIX, label_names
@@ -175,11 +175,6 @@ def _is_image(folder: Path, path: PurePosixPath) -> bool:
     # A link to a missing file is an image that cannot be read.
     has_suffix = path.suffix.lower() in SUFFIXES
     return has_suffix and (os.path.isfile(folder / path) or not os.path.exists(folder / path))
-
-
-def is_hidden(name: str) -> bool:
-    """Return whether a file or folder is hidden, or was added by macOS."""
-    return name.startswith(".") or name == "__MACOSX"
 
 
 def visible_files(folder: Path) -> Iterator[PurePosixPath]:

@@ -369,6 +369,7 @@ def test_backgrounds_come_from_the_images_of_a_folder(scene, tmp_path):
         file.parent.mkdir(exist_ok=True)
         Image.fromarray(draws.integers(0, 256, (SIZE, SIZE, 3)).astype(np.uint8)).save(file)
     (tmp_path / "notes.txt").write_text("no image")
+    (tmp_path / "._a.png").write_text("notes of macOS about a.png")
     is_free = ~(images_of(scene).sum(1) > 0).any(0)
     choices = [read_image(file, SIZE)[:, is_free] for file in files]
     shown = set()

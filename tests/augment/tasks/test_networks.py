@@ -45,6 +45,13 @@ def of_torchvision(library, name: str, **options) -> nn.Module:
     return network.eval()
 
 
+def test_the_number_of_classes_is_not_that_of_a_backbone():
+    network = of_torchvision(detection, "fasterrcnn_mobilenet_v3_large_320_fpn", **SMALL)
+    network.backbone.num_classes = 1000
+    names = ["background", "ball", "cup"]
+    assert as_network(network, SIZE, names).classes == tuple(names)
+
+
 def require_slope(network, task, step: float = 1e-7, rtol: float = 1e-3) -> None:
     """Compare the slope of the cost along its gradient in pixels with that by finite differences.
 
