@@ -122,9 +122,9 @@ def attack(
     Raises:
         InputError: If an argument has a wrong type, if an example is
             misclassified before the attack, if the classifier lacks a class, or
-            if a target is the true class of an example. Also if a plain network
-            is in training mode, normalizes images twice, or does not return a
-            row of logits for each image.
+            if a target is the true class of an example, or if the renders do not
+            fit in memory. Also if a plain network is in training mode, normalizes
+            images twice, or does not return a row of logits for each image.
 
     Example:
         >>> import torch

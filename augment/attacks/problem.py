@@ -130,6 +130,7 @@ def build_problem(settings: AttackSettings, scene: Scene) -> SceneProblem:
     Unless `settings.allow_negative`, negative radiance is first removed from the light of the
     scene.
     """
+    scene.require_memory()
     if not settings.allow_negative:
         physical = scene.basis.project_nonnegative(scene.lights)
         if not torch.equal(physical, scene.lights):

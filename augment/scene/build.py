@@ -112,8 +112,7 @@ def build_scene(
 
     Raises:
         InputError: If an argument has the wrong type, is unknown or out of
-            bounds, if a file is missing, or if the renders do not fit in
-            memory.
+            bounds, or if a file is missing.
 
     Example:
         >>> from dataclasses import replace

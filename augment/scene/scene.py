@@ -135,9 +135,6 @@ class Scene:
 
         self.group_size = max(1, AT_ONCE // (self.views * settings.pixel_count))
         self.attack_bytes = self._count_attack_bytes()
-        height, width = settings.shape
-        count = f"{len(self) * self.views} renders of {height} × {width} pixels"
-        errors.require_memory(f"{count} (meshes × views × backgrounds)", self.attack_bytes, device)
         # Images are numbered by example and then by view: e · V + v.
         built_with: dict[str, Any] = {"rasterizer": rasterizer, "basis": basis}
         if device.type == "cuda":
@@ -156,6 +153,13 @@ class Scene:
         self._direct_renderer = DirectRenderer(
             self.objects, settings, rasterizer, basis, like=self.lights, one_light=one_light
         )
+
+    def require_memory(self) -> None:
+        """Check that there is memory for an attack on all examples."""
+        height, width = self.settings.shape
+        count = f"{len(self) * self.views} renders of {height} × {width} pixels"
+        name = f"{count} (meshes × views × backgrounds)"
+        errors.require_memory(name, self.attack_bytes, self.lights.device)
 
     def _count_attack_bytes(self) -> int:
         """Estimate the memory of an attack on all examples."""

@@ -122,7 +122,7 @@ def _read_part(
         uvs = attributes[uv_name]
     require_bounded(coordinates=positions, colors=colors, **{"texture coordinates": uvs})
     # From here on, texture coordinates are those of `Mesh`: textures repeat, and v points up.
-    material, uvs = material.placed(uvs)
+    material, uvs = material.placed(uvs, file)
     normals = attributes.get("NORMAL", np.zeros_like(positions))
     # The columns have the order of `_Surface.values`.
     values = np.column_stack([positions, uvs, colors[:, 3], colors[:, :3], normals])

@@ -44,11 +44,13 @@ class GltfFile:
         file: The file, with the files beside it.
         tree: JSON object of the file.
         poses: Matrix (4, 4) from the axes of each node to the axes of the scene.
+        extended: Pairs of a texture and an extended copy (`Material.placed`), which parts share.
     """
 
     def __init__(self, file: MeshFile) -> None:
         """Parse the JSON of a file, and check its version."""
         self.file = file
+        self.extended: dict[tuple[int, ...], tuple[np.ndarray, np.ndarray]] = {}
         content = file.content
         self._binary_chunk: bytes | None = None
         if content.startswith(b"glTF"):
@@ -284,7 +286,7 @@ class Material:
     gloss: Float[np.ndarray, " 3"] | None = None
     gloss_texture: UInt8[np.ndarray, "_ _ 2"] | None = None
 
-    def placed(self, uvs: np.ndarray) -> tuple["Material", np.ndarray]:
+    def placed(self, uvs: np.ndarray, file: GltfFile) -> tuple["Material", np.ndarray]:
         """Convert texture coordinates (V, 2) of the file to those of `Mesh`.
 
         The textures of `Mesh` repeat. A texture that is mirrored is therefore
@@ -322,11 +324,14 @@ class Material:
             new_count = before + count + after
             for name, texels in textures.items():
                 length = texels.shape[1 - axis] // count
-                new_size = length * new_count * texels.shape[axis]
-                require_memory("textures", TEXEL_BYTES * new_size, CPU)
-                padding = [(0, 0)] * texels.ndim
-                padding[1 - axis] = (length * before, length * after)
-                textures[name] = np.pad(texels, padding, mode)
+                key = id(texels), axis, length * before, length * after
+                if key not in file.extended:
+                    new_size = length * new_count * texels.shape[axis]
+                    require_memory("textures", TEXEL_BYTES * new_size, CPU)
+                    padding = [(0, 0)] * texels.ndim
+                    padding[1 - axis] = key[2:]
+                    file.extended[key] = texels, np.pad(texels, padding, mode)
+                _, textures[name] = file.extended[key]
             # The same texel has another coordinate in the larger texture.
             uvs[:, axis] = (coordinates * count + before) / new_count
         # v points down in glTF, and up in `Mesh`.

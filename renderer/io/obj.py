@@ -193,8 +193,9 @@ def _corners(words: list[bytes]) -> np.ndarray:
 def _materials(lines: dict[str, _Lines], file: MeshFile) -> tuple[list[_Material], np.ndarray]:
     """Read the used materials, a white one first, and find the index of the one of each face."""
     library = _library(lines["mtllib"].names(), file)
-    # Name of the material of each line "usemtl", after None for faces before these lines.
-    names = [None, *lines["usemtl"].names()]
+    # Name of the material of each line "usemtl", after None for faces before these lines. Blender
+    # writes a line without a name for faces without a material.
+    names = [None, *(name or None for name in lines["usemtl"].names())]
     # Each face has the material of the last line "usemtl" before it.
     choice_of_face = np.searchsorted(lines["usemtl"].numbers, lines["f"].numbers)
     used = list(dict.fromkeys([None, *(names[choice] for choice in np.unique(choice_of_face))]))
@@ -241,6 +242,15 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
         raise ValueError(f"no .mtl file defines the material {name}")
     folder, is_linear, properties = definition
     material = _Material()
+    texts = {keyword.lower(): text for keyword, text in properties}
+    emitted = {key for key in ("ke", "map_ke") if texts.get(key, "").strip("0. ")}
+    if emitted and "map_kd" not in texts and not texts.get("kd", "1").strip("0. "):
+        file.assume("the light that a black material emits is taken as its color")
+        properties = [
+            (key.lower().replace("ke", "kd") if key.lower() in emitted else key, text)
+            for key, text in properties
+            if key.lower() != "kd"
+        ]
     # Opacity ("d") or transparency ("tr"), of which "d" counts if a material has both.
     opacities = {}
     for keyword, text in properties:

@@ -6,6 +6,8 @@ import torch
 from torch import nn
 
 from augment import AugmentationService, AugmentationSettings
+from augment.attack_settings import AttackSettings, StepSettings
+from augment.attacks.problem import build_problem
 from augment.augmentation_settings import CameraEffectSettings, TrainingAttackSettings
 from augment.scene import scene
 from augment.scene.build import build_scene
@@ -68,8 +70,10 @@ def test_attacks_on_light_take_half_to_all_of_the_memory_they_require(monkeypatc
 def test_renders_and_views_need_their_memory_before_any_is_made(monkeypatch):
     shown = build_scene(ORANGE, 64, 100, rasterizer="numpy", samples=1)
     monkeypatch.setattr(errors, "free_memory", lambda device: 10**6)
+    grays = (0, 0.25, 0.5, 0.75, 1)
+    many = build_scene(ORANGE, 64, 200, backgrounds=grays, rasterizer="numpy")
     with pytest.raises(InputError, match=r"^1000 renders of 64 × 64 pixels .* 0\.4 GB"):
-        build_scene(ORANGE, 64, 200, backgrounds=(0, 0.25, 0.5, 0.75, 1), rasterizer="numpy")
+        build_problem(AttackSettings(lighting=StepSettings()), many)
     with pytest.raises(InputError, match=r"^100 views of 64 × 64 pixels"):
         first = torch.arange(1)
         shown.render(shown.conditions(first), first)

@@ -133,7 +133,6 @@ class Coco(DataSet):
 
     def finish(self) -> None:
         """Write annotations/instances_PART.json for each part."""
-        renders = [json.loads(self.last_file(index).read_text()) for index in range(self.count)]
         categories = [
             {"id": number, "name": name, "supercategory": name}
             for number, name in enumerate(self.classes, 1)
@@ -141,9 +140,10 @@ class Coco(DataSet):
         numbers = itertools.count(1)
         for part in self.splits:
             images, annotations = [], []
-            for render in (one for one in renders if one["split"] == part):
+            for index in (one for one in range(self.count) if self.split(one) == part):
+                render = json.loads(self.last_file(index).read_text())
                 # Ids of COCO count from 1.
-                image_id, name = render["index"] + 1, Path(render["image"]).name
+                image_id, name = index + 1, Path(render["image"]).name
                 height, width = render["size"]
                 images.append({"id": image_id, "file_name": name, "height": height, "width": width})
                 # Trainers refuse the empty box of an object that covers half of no pixel.

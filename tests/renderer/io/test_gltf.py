@@ -152,6 +152,18 @@ def test_textures_are_wrapped_as_opengl_wraps_them(tmp_path, wrap_u, wrap_v, glo
     assert_allclose(albedo_at(mesh, uvs), expected, atol=1e-5)
 
 
+@pytest.mark.parametrize("wrap", [33071, 33648])
+def test_parts_with_one_texture_share_its_extended_copy(tmp_path, wrap):
+    gltf = Gltf()
+    texture = gltf.texture(color_texels(3, 4), wrapS=wrap, wrapT=wrap)
+    gltf.square(pbrMetallicRoughness={"baseColorTexture": texture})
+    gltf.mesh({"POSITION": SQUARE + 1, "TEXCOORD_0": SQUARE_UVS / 2}, SQUARE_FACES, material=0)
+    gltf.tree["nodes"] = [{"mesh": 0}, {"mesh": 1}]
+    gltf.tree["scenes"] = [{"nodes": [0, 1]}]
+    mesh = gltf.load(tmp_path)
+    assert len(mesh.faces) == 4 and len(mesh.textures) == 1
+
+
 def test_texture_coordinates_are_scaled_then_rotated_then_shifted(tmp_path):
     """The corner (1, 0) turns towards (0, -1): counter-clockwise, as v points down."""
     gltf = Gltf()

@@ -183,6 +183,26 @@ def test_a_gray_color_beside_a_texture_does_not_darken_it(tmp_path, gray):
     assert_array_equal(mesh.corner_colors, np.ones((1, 3, 3)))
 
 
+def test_faces_of_a_material_without_a_name_are_white(tmp_path):
+    assert face_colors(load(tmp_path, PLAIN.replace("usemtl green", "usemtl "))) == [
+        *(RED, RED),
+        *(WHITE, WHITE),
+    ]
+
+
+@pytest.mark.filterwarnings("ignore:ignored in .obj files", "ignore:.*black material emits")
+@pytest.mark.parametrize(
+    ("light", "color", "count"),
+    [("Ke 0 1 0", GREEN, 0), ("Ke 0 0 0\nmap_Ke t.png", WHITE, 1), ("Ke 0.0 0 0", (0, 0, 0), 0)],
+)
+def test_the_light_of_a_black_material_is_its_color(tmp_path, light, color, count):
+    """Blender writes a texture without shading like this."""
+    (tmp_path / "t.png").write_bytes(png_of(255, 0, 0))
+    text = "v 0 0 0\nv 1 0 0\nv 0 1 0\nvt 0 0\nmtllib m.mtl\nusemtl red\nf 1/1 2/1 3/1\n"
+    mesh = load(tmp_path, text, m=f"newmtl red\nKd 0.0 0 0\n{light}\n")
+    assert face_colors(mesh) == [color] and len(mesh.textures) == count
+
+
 def test_materials_with_different_textures_keep_them_apart(tmp_path):
     for name, color in (("r", (255, 0, 0)), ("g", (0, 255, 0))):
         (tmp_path / f"{name}.png").write_bytes(png_of(*color))
