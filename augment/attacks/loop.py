@@ -194,8 +194,9 @@ def _minimize_group(
         result.queries[rows[checked]] += noisy_count
         is_success = latest.success.clone()
         with frozen_eval_mode(objective.model):
-            part = objective.select(rows[checked])
-            is_success[checked] = part.is_robust(latest.images[checked], examples[rows[checked]])
+            part, shown = objective.select(rows[checked]), examples[rows[checked]]
+            moved = part.moved(optimizer.problem, latest.values[checked], shown)
+            is_success[checked] = moved.is_robust(latest.images[checked], shown)
         rows = rows[~is_success]
         if not len(rows):
             break
@@ -243,7 +244,8 @@ def minimize_from(
                 result = Minimum.at_start(evaluation)
             is_accepted = optimizer.tell(active, evaluation)
             score = evaluation.score
-            is_finished, noisy_count = part.finished(score, evaluation.images, shown, drops)
+            moved = part.moved(optimizer.problem, evaluation.values, shown)
+            is_finished, noisy_count = moved.finished(score, evaluation.images, shown, drops)
             # An example without a success takes each candidate that the optimizer accepts as its
             # result. An example with a success takes only successes of lower cost.
             is_cheaper = score.is_success & (score.cost < result.cost[active])

@@ -6,6 +6,7 @@ from torch import Tensor
 from torchvision.ops import batched_nms, box_iou
 
 import norm_balls as nb
+from augment.attack_settings import PoseSettings
 from augment.classifier import as_network
 from augment.scene.truth import Truth
 from tests.detectors import small_detector
@@ -134,6 +135,22 @@ def test_an_object_that_is_not_found_before_is_reported_and_no_success(goal):
     result = nb.attack(brightness_detector, scene, **options, force=True)
     assert result.success_in_views.all()
     assert not result.clean_correct.any() and not result.success.any()
+
+
+def test_noise_is_tested_where_an_attack_has_moved_the_object():
+    """The box stays, and its score falls slowly: IoU decides, after half of the shift."""
+    scene = ball_scene(silhouettes=True, light="uniform", backgrounds=[0.0])
+    box = scene.truth(lambda label: 0).boxes[0, 0, :1]
+
+    def stays(images: Tensor) -> list[dict[str, Tensor]]:
+        scores = images[:, :, 2:14, 2:14].mean((1, 2, 3), keepdim=True).flatten(1)
+        return [{"boxes": box, "labels": torch.tensor([0]), "scores": score} for score in scores]
+
+    unmoved = dict.fromkeys(["rotation", "view", "distance", "scale"], 0.0)
+    pose = PoseSettings(**unmoved, shift=0.8, step_size=0.1, step="sign")
+    settings = nb.AttackSettings(pose=pose, max_steps=30, margin=0.0, noise_margin=1.0)
+    found = nb.attack(stays, scene, task=nb.Detection(0.2), settings=settings, classes=CLASSES)
+    assert found.success.all() and found.minimum.steps < 15
 
 
 def test_a_task_with_another_goal_replaces_that_of_a_loaded_network():
