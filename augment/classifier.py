@@ -31,8 +31,6 @@ UNIT_RANGE = (0.0, 1.0)
 USUAL_SIZE = 224
 # Number of images that count the outputs. Logits of one could look like probabilities by chance.
 CHECKED_COUNT = 2
-# Names of module classes of torchvision, kornia and this library that normalize images.
-NORMALIZING = frozenset({"Normalize", "ChannelNormalization"})
 # Network or function from images to outputs.
 ImageFunction = Callable[[Tensor], Any]
 # Name of one positive class, or names of several.
@@ -561,14 +559,10 @@ def _preprocessed(
     if normalization is None and (black, white) == UNIT_RANGE:
         return module.eval()
     if normalization is not None:
-        # Networks of several libraries are known by the names of their modules and buffers.
-        kinds = {type(part).__name__ for part in module.modules()} & NORMALIZING
-        buffers = [name for name, _ in module.named_buffers()]
-        means = [name for name in buffers if name.rpartition(".")[2] in wrappers.MEANS]
-        found = sorted(kinds) + sorted(means)
-        if found:
-            reason = f"normalization is given, but the network contains {found[0]}"
-            raise InputError(f"{reason}, which normalizes images again: leave normalization out")
+        own = wrappers.normalization_of(module)
+        if own:
+            reason = f"normalization is given, but in the network, images are {own} again"
+            raise InputError(f"{reason}: leave normalization out")
         if normalization == IMAGENET:
             # Scaling the mean and the standard deviation of ImageNet to the range of the network
             # is the same as normalizing values in [0, 1] with them.

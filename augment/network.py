@@ -36,6 +36,8 @@ YOU, FILE, NETWORK, DATA = "you", "the file", "the network", "the training image
 # Names of the mean of the channels in networks that normalize images themselves. That of the
 # standard deviation ends with "std" instead.
 MEANS = ("mean", "image_mean", "pixel_mean")
+# Parts of the names of modules that normalize images, such as `Normalize` of torchvision.
+NORMALIZING = "Normaliz", "RCNNTransform"
 # What a function takes: tensors, arrays of float32, or tensors without gradients.
 TENSORS, ARRAYS, DETACHED = "tensors", "arrays", "detached tensors"
 
@@ -518,8 +520,9 @@ def normalization_of(network: Any, limits: tuple[float, float] = (0.0, 1.0)) -> 
     for module in network.modules() if isinstance(network, nn.Module) else ():
         for name in MEANS:
             names = name, name.replace("mean", "std")
-            mean, std = (_channels(getattr(module, found, None)) for found in names)
-            if mean and std:
+            mean, std = (_channels(module, found) for found in names)
+            if mean:
+                std = std or [1.0] * 3
                 # The network normalizes values in [0, 1]. Convert to the units of the limits.
                 mean = [black + (white - black) * value for value in mean]
                 std = [(white - black) * value for value in std]
@@ -531,9 +534,22 @@ def normalization_of(network: Any, limits: tuple[float, float] = (0.0, 1.0)) -> 
     return ""
 
 
-def _channels(value: Any) -> list[float]:
-    """Return the numbers of three channels. Any other value gives an empty list."""
-    if not isinstance(value, Tensor | list | tuple):
+def _channels(module: nn.Module, name: str) -> list[float]:
+    """Return the numbers of this name with which a module normalizes three channels, or [].
+
+    Tensors count. Lists and single numbers, which may only document what the user has to do, count
+    in modules that are named after it.
+    """
+    own = getattr(module, "original_name", type(module).__name__)  # A script has another class.
+    is_named = any(part in own for part in NORMALIZING)
+    # `kornia.augmentation.Normalize` keeps them in a dictionary.
+    flags = getattr(module, "flags", None)
+    value = flags.get(name) if isinstance(flags, dict) else getattr(module, name, None)
+    # A network of OpenMMLab does not call the preprocessor that it contains.
+    is_called = "BaseDataPreprocessor" not in [kind.__name__ for kind in type(module).__mro__]
+    kinds = Tensor | list | tuple | float if is_named else Tensor
+    if not (is_called and isinstance(value, kinds)):
         return []
     numbers = torch.as_tensor(value).flatten().tolist()
+    numbers *= 3 if is_named and len(numbers) == 1 else 1
     return numbers if len(numbers) == 3 else []

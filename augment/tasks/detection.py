@@ -347,6 +347,7 @@ class _Reader:
             outputs = _of_transformer(outputs, images, title, self.class_count)
         if _is_ultralytics(outputs):
             outputs, is_raw = _of_ultralytics(outputs[0]), True
+            title += " (read as of Ultralytics; others need nb.Detection(decode=...))"
         if not len(images):
             return []
         if not task.recognizes(outputs) or len(outputs) != len(images):
@@ -494,7 +495,8 @@ def _of_transformer(
 def _is_ultralytics(outputs: Any) -> bool:
     """Return whether outputs are a tensor of boxes, and what Ultralytics computes it from."""
     is_pair = isinstance(outputs, tuple) and len(outputs) == 2
-    return is_pair and isinstance(outputs[0], Tensor) and outputs[0].ndim == 3
+    is_batch = is_pair and isinstance(outputs[0], Tensor) and outputs[0].ndim == 3
+    return is_batch and (outputs[0].shape[1] > 4 or outputs[0].shape[2] == 6)
 
 
 def _of_ultralytics(outputs: Tensor) -> list[dict[str, Tensor]]:

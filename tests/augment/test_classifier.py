@@ -17,6 +17,7 @@ import renderer
 from augment.classifier import CheckedNetwork, Classifier, as_network, remembering
 from augment.network import ChannelNormalization, Network, say_once
 from renderer import InputError
+from tests.detectors import small_detector
 
 MEAN = (0.485, 0.456, 0.406)
 STD = (0.229, 0.224, 0.225)
@@ -162,7 +163,7 @@ def without_eval(network: nn.Sequential) -> nn.Module:
 
 
 def with_pixel_mean(network: nn.Module) -> nn.Module:
-    network.register_buffer("pixel_mean", torch.zeros(3))
+    network.register_buffer("pixel_mean", torch.full((3,), 0.5))
     return network
 
 
@@ -175,9 +176,10 @@ def with_pixel_mean(network: nn.Module) -> nn.Module:
         (
             lambda network: nn.Sequential(Normalize(MEAN, STD), network).eval(),
             {"normalization": "imagenet"},
-            "Normalize",
+            "leave normalization out",
         ),
-        (with_pixel_mean, {"normalization": "imagenet"}, "pixel_mean"),
+        (with_pixel_mean, {"normalization": "imagenet"}, "leave normalization out"),
+        (lambda _: small_detector(3, SIZE), {"normalization": "imagenet"}, "normalization out"),
         (lambda network: network, {"classes": CLASSES[:2]}, "classes has 2 names"),
         (lambda network: network, {"normalization": BYTES}, "value_range"),
         (lambda _: nn.Flatten, {}, "Flatten"),
@@ -270,6 +272,31 @@ def test_normalization_is_said_in_the_units_of_the_user_and_as_a_network_states_
     first, second = said()
     assert "std (1, 2, 1), stated by you; values from -1 to 1, stated by you" in first
     assert f"{IMAGENET}, stated by the network; values from 0 to 1, assumed" in second
+
+
+class BaseDataPreprocessor(ChannelNormalization):
+    """Preprocessor as those of OpenMMLab, which a network contains and does not call."""
+
+
+@pytest.mark.parametrize("kind", ["documented", "not called", "of features"])
+def test_a_network_that_only_mentions_a_mean_is_normalized_as_the_user_says(kind, network, images):
+    if kind == "documented":
+        network.image_mean, network.image_std = MEAN, STD
+    elif kind == "not called":
+        network[0].data_preprocessor = BaseDataPreprocessor(MEAN, STD).eval()
+    else:
+        network.register_buffer("mean", torch.zeros(5))
+        network.register_buffer("std", torch.ones(5))
+    assert "; not normalized, assumed" in as_network(network, SIZE).describe_inputs()
+    classifier = as_network(network, SIZE, normalization="imagenet")
+    assert f"{IMAGENET}, stated by you" in classifier.describe_inputs()
+    torch.testing.assert_close(classifier(images), network(Normalize(MEAN, STD)(images)))
+
+
+def test_the_normalization_of_a_layer_of_kornia_is_stated_by_the_network(network):
+    layer = pytest.importorskip("kornia").augmentation.Normalize(0.5, 0.25)
+    inputs = as_network(nn.Sequential(layer, network).eval(), SIZE).describe_inputs()
+    assert "mean (0.5, 0.5, 0.5) and std (0.25, 0.25, 0.25), stated by the network" in inputs
 
 
 @pytest.mark.parametrize("wrap", [lambda x: {"logits": x}, lambda x: (x, 0), SimpleLogits])

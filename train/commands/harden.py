@@ -36,6 +36,13 @@ from train.training.run_log import Logger
 
 # Values of some settings of a group, such as "train", by name. None for the defaults.
 Section = Mapping[str, Any] | None
+# Settings `train` that a detector cannot have, unless they are off or texts other than these, which
+# need logits or move what a box surrounds.
+UNFIT_SETTINGS = (
+    *("augmentation", "freeze", "interpolate"),
+    *("label_smoothing", "ranking_weight", "relight_steps"),
+)
+UNFIT_TEXTS = "all_but_last", "augmix", "color_jitter+augmix", "pgd", "trivial_augment"
 
 
 def harden(
@@ -181,6 +188,11 @@ def harden(
         if settings.train.recognize and not isinstance(network, TaskNetwork):
             fault = "train.recognize=true needs a network that keeps what recognizes the light"
             raise InputError(f"{fault}: give an nb.Classifier instead", "train.recognize")
+        for name in UNFIT_SETTINGS if is_detector else ():
+            value = getattr(settings.train, name)
+            if value in UNFIT_TEXTS if isinstance(value, str) else value:
+                fault = f"train.{name}={value} is for classifiers"
+                raise InputError(f"{fault}: choose another value", f"train.{name}")
         require_new_run(folder, "out", overwrite, settings.train.resume)
         if meshes or label is not None:
             settings = class_names.with_class_names(settings, classifier.classes)

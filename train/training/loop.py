@@ -118,10 +118,6 @@ class TrainingStep:
             is_compiled = compiles(settings.compile, device)
         self._loss: Callable[..., tuple[Tensor, Tensor]]
         if isinstance(service.task, Detection):
-            if settings.relight_steps:
-                raise InputError("relight_steps attacks classifiers: set it to 0", "relight_steps")
-            if settings.interpolate:
-                raise InputError("interpolate mixes classifiers: set it to False", "interpolate")
             is_compiled = False
             self._loss = DetectionLoss(replica, settings, teacher, service.task).compute
         else:

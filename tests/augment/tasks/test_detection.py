@@ -190,6 +190,18 @@ def test_impossible_boxes_are_refused(change, message):
         nb.Detection().reader("network", 3)([item], torch.zeros(1, 3, SIZE, SIZE))
 
 
+@pytest.mark.parametrize(
+    ("boxes", "rest", "message"),
+    [
+        (torch.rand(1, 2, 4), torch.rand(1, 2, 3), "list of a dictionary"),
+        (9 * torch.ones(1, 20, 8), [], r"nb\.Detection\(decode"),  # Layout of YOLOv5.
+    ],
+)
+def test_a_pair_that_is_not_of_ultralytics_is_refused(boxes, rest, message):
+    with pytest.raises(nb.InputError, match=message):
+        nb.Detection().reader("network")((boxes, rest), torch.zeros(1, 3, SIZE, SIZE))
+
+
 @pytest.mark.parametrize("box", [[16.0, 3.0, 16.0, 9.0], [3.0, 0.0, 9.0, 0.0]])
 def test_boxes_that_were_clipped_at_the_border_are_possible(box):
     item = {name: torch.tensor(value) for name, value in (BOX | {"boxes": [box]}).items()}

@@ -206,8 +206,20 @@ WITHOUT_SCORES = {"task": Detection(threshold=0.1, decode=bright_box), "augment"
 @pytest.mark.parametrize(
     ("network", "meshes", "options", "reason"),
     [
-        (OneBox(SIZE), ("solid:bottle",), {"train": {"interpolate": 1}}, "train.interpolate"),
-        (OneBox(SIZE), ("solid:bottle",), {"train": {"relight_steps": 1}}, "train.relight_steps"),
+        *[
+            (OneBox(SIZE), (), {"train": {name: value}}, f"^train.{name}=")
+            for name, value in (
+                ("interpolate", True),
+                ("relight_steps", 1),
+                ("label_smoothing", 0.1),
+                ("ranking_weight", 0.1),
+                ("freeze", "all_but_last"),
+                ("augmentation", "pgd"),
+                ("augmentation", "trivial_augment"),
+                ("augmentation", "augmix"),
+                ("augmentation", "color_jitter+augmix"),
+            )
+        ],
         (RawCells(), ("solid:bottle",), RAW, "meshes: a raw network"),
         (RawCells(), (), WITHOUT_SCORES, "labels"),
         (without_losses(), ("solid:bottle",), {}, "training mode"),
