@@ -241,25 +241,12 @@ def test_training_loop_block_trains_on_data_and_renders():
 
 @pytest.mark.ecosystem
 @pytest.mark.filterwarnings("default")
-def test_lightning_block_trains_on_data_and_renders():
-    lightning = pytest.importorskip("lightning")
+def test_lightning_block_trains_the_module_of_the_guide_on_data_and_renders():
+    pytest.importorskip("lightning")
+    guide = run("In a Lightning module", network=linear_network()[0], data=PHOTOGRAPHS)
     network, before = linear_network()
-
-    class Module(lightning.LightningModule):
-        def __init__(self):
-            super().__init__()
-            self.network = network
-
-        def forward(self, images):
-            return self.network(images)
-
-        def training_step(self, batch, index):
-            return nn.functional.cross_entropy(self(batch[0]), batch[1])
-
-        def configure_optimizers(self):
-            return torch.optim.SGD(self.parameters(), lr=0.01)
-
-    names = run("PyTorch Lightning, and loggers", module=Module(), data=PHOTOGRAPHS)
+    module = guide["Classifier"](network)
+    names = run("PyTorch Lightning, and loggers", module=module, data=PHOTOGRAPHS)
     assert len(names["callback"].renders.current) == 10
     assert not torch.equal(network[1].weight, before)
 

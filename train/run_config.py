@@ -266,8 +266,9 @@ def _fingerprint(path: Path) -> str:
 
     path = selected_file(path) or path
     if path.is_file():
-        # The materials, textures and buffers of a mesh.
-        beside = [_hash_file(file) for file in files_beside(path)]
+        # The materials, textures and buffers of a mesh, and the weights of a network of ONNX.
+        data = path.with_name(f"{path.name}.data")
+        beside = [_hash_file(file) for file in (*files_beside(path), data) if file.is_file()]
         return _hash([_hash_file(path), *beside]) if beside else _hash_file(path)
     names = sorted(map(str, visible_files(path)))
     files = {name: path / name for name in names if (path / name).is_file()}

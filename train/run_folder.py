@@ -128,17 +128,20 @@ def sole_writer(key: str, *folders: Path) -> Iterator[None]:
 def state(folder: Path) -> str:
     """Describe the state of a run that is not finished.
 
-    It is "not begun", "in training", "interrupted" or "failed: " and the reason.
+    It is "not begun", "in training", "interrupted", "failed: " and the reason, or "not finished" in
+    a folder that cannot be locked.
     """
     if not folder.exists():
         return "not begun"
-    # The process that trains the run holds its lock.
-    with locked(folder) as is_ours:
+    unless_failed = "not finished"
+    # The process that trains the run holds its lock. In a read-only folder, OSError is raised.
+    with suppress(OSError), locked(folder) as is_ours:
         if not is_ours:
             return "in training"
+        unless_failed = "interrupted"
     failure = folder / FAILURE
     if not failure.exists():
-        return "interrupted"
+        return unless_failed
     return f"failed: {failure.read_text(encoding='utf-8', errors='replace').strip()}"
 
 

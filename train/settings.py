@@ -67,7 +67,7 @@ TIME_FOLDER = "${now:%Y-%m-%d}/${now:%H-%M-%S-%f}"
 # Settings and recorded facts that do not change the result of a training run, such as
 # its folder and its device. Two runs that differ only in these settings are equal.
 CIRCUMSTANCES = (
-    *("sweep", "out", "device", "launcher", "compare", "command", "working_folder"),
+    *("sweep", "out", "device", "launcher", "compare", "command", "working_folder", "hashes"),
     *("hardware", "versions", "inputs", "images", "test_images", "overwrite", "train.cache"),
     *("train.resume", "train.device", "train.threads", "train.compile", "train.checkpoint_every"),
 )

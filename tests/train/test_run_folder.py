@@ -124,6 +124,8 @@ INPUT_FILES = {
     "network.py": "# ab\n",
     "wall.png": "ab",
     "classes.txt": "ab",
+    "network.onnx": "ab",
+    "network.onnx.data": "ab",
 }
 AUDIT = {"network": "c", "meshes": ["solid:orange"], "out": "audit"}
 
@@ -140,6 +142,7 @@ AUDIT = {"network": "c", "meshes": ["solid:orange"], "out": "audit"}
         (AUDIT | {"network": "python:network:build"}, "network.py"),
         (AUDIT | {"network": "python:network.build"}, "network.py"),
         (AUDIT | {"decode": "network:decode"}, "network.py"),
+        (AUDIT | {"network": "network.onnx"}, "network.onnx.data"),
         (AUDIT | {"network": "hf:photographs"}, "photographs/orange/a.png"),
         (AUDIT | {"network": "lit:c+run:photographs"}, "photographs/orange/a.png"),
         (AUDIT | {"hardened": "dim:run:photographs+d"}, "photographs/orange/a.png"),

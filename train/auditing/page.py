@@ -348,7 +348,8 @@ def _draw(predictions: Predictions, row: int, folder: Path) -> Picture:
     """Draw an image of a folder over its class, its source and what a network predicts."""
     photograph = predictions.photograph[row]
     text = first_screen.describe_prediction(predictions, row).text
-    caption = f"{in_words(photograph.label)}, {photograph.source}: {text}"
+    subject = ", ".join(map(in_words, filter(None, (photograph.label, photograph.source))))
+    caption = f"{subject}: {text}"
     return read_square(folder / photograph.path, SIDE, caption, caption)
 
 

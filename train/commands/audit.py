@@ -10,6 +10,7 @@ The folder of the audit has a subfolder of results for each network. The names o
 the subfolders are CLASSIFIER and HARDENED.
 """
 
+import hashlib
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from augment.attack_settings import RelightingSettings
 from augment.classifier import UNIT_RANGE, Classifier, Normalization, TaskNetwork, as_network
@@ -246,7 +247,7 @@ def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page
     described = [f"Images of {one.name}: {one.describe_inputs()}." for one in networks.values()]
     caveats = [*described, *caveats]
     with sole_writer("out", out):
-        _prepare_folder(settings, out, renders)
+        _prepare_folder(settings, out, renders, networks)
         for key in networks:
             (out / key).mkdir(exist_ok=True)
         names = {key: network.name for key, network in networks.items()}
@@ -489,16 +490,17 @@ def complete(settings: AuditSettings, classes: Sequence[str]) -> AuditSettings:
     return replace(settings, label=label, **items)
 
 
-def _prepare_folder(settings: AuditSettings, out: Path, renders: Path) -> None:
+def _prepare_folder(settings: AuditSettings, out: Path, renders: Path, networks: Networks) -> None:
     """Prepare the folder of an audit, and write the settings to its file config.yaml.
 
     With `settings.overwrite`, the results of an earlier audit are removed.
-    Otherwise an earlier audit in the folder must have the same settings.
+    Otherwise an earlier audit in the folder must have the same settings and weights.
     """
+    hashes = {key: _hash_weights(network) for key, network in networks.items()}
     if settings.overwrite:
-        networks = (key + end for key in (CLASSIFIER, HARDENED) for end in ("", lights.NORMALIZED))
+        folders = (key + end for key in (CLASSIFIER, HARDENED) for end in ("", lights.NORMALIZED))
         (out / PAGE).unlink(missing_ok=True)
-        for name in (*networks, renders.name):
+        for name in (*folders, renders.name):
             # A folder that exists counts as complete, so it loses its name first.
             removed = out / f"{name}.part"
             shutil.rmtree(removed, ignore_errors=True)
@@ -507,10 +509,22 @@ def _prepare_folder(settings: AuditSettings, out: Path, renders: Path) -> None:
             shutil.rmtree(removed, ignore_errors=True)
     elif (out / CONFIG).exists():
         # A stopped audit may continue with a change of some settings, but only from None.
-        require_same(
+        recorded = require_same(
             out, settings, "out=", lambda key, old, _: old is None and key in SETTABLE_LATER
         )
-    write_config(out, settings, command=command_line("audit"))
+        for key, found in hashes.items():
+            if (recorded.get("hashes") or {}).get(key, found) != found:
+                fault = f"{networks[key].name} has other weights than when {out} began"
+                raise InputError(f"{fault}: set another out=, or overwrite=true")
+    write_config(out, settings, command=command_line("audit"), hashes=hashes)
+
+
+def _hash_weights(network: nn.Module) -> str:
+    """Compute the SHA-256 of the weights of a network, which no input file may contain."""
+    digest = hashlib.sha256()
+    for tensor in (*network.parameters(), *network.buffers()):
+        digest.update(tensor.detach().cpu().flatten().view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
 
 
 def _write_renders(settings: AuditSettings, plan: _Plan, size: Size, out: Path) -> None:

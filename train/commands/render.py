@@ -9,6 +9,7 @@ from typing import Any
 from augment import dataset
 from augment.progress import progress
 from renderer.errors import InputError, keyed, keys_of
+from train import console
 from train.checkpoints import load_chosen
 from train.class_names import name_of_mesh
 from train.command_settings import RenderSettings
@@ -35,6 +36,9 @@ def run(settings: RenderSettings) -> None:
     for item in objects:
         item.label = item.label or default or name_of_mesh(item.mesh)
     labels = [of.label for item in objects for of in (item, *item.others)]
+    unlabeled = [other.mesh for item in objects for other in item.others if not other.label]
+    if unlabeled:
+        console.warning("drawn but not annotated, without a label: %s", ", ".join(unlabeled))
     classes = [*dict.fromkeys(label for label in labels if label)]
     folder = writable_folder(settings.out, "out")
     for name in classes if settings.format == "imagefolder" else ():

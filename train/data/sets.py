@@ -5,6 +5,7 @@ that training shows it.
 """
 
 import hashlib
+import signal
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -139,7 +140,7 @@ class ImageFiles:
         errors: ReadErrors = {}
         options: dict[str, Any] = {"num_workers": self.workers, "collate_fn": _collate}
         # Otherwise, each loader draws from the global generator, also when a run is resumed.
-        options["generator"] = torch.Generator()
+        options |= {"generator": torch.Generator(), "worker_init_fn": _leave_signal}
         loader: DataLoader = DataLoader(_Reader(self), batch_sampler=list(batches), **options)
         for images, errors_in_batch in loader:
             errors |= errors_in_batch
@@ -151,6 +152,11 @@ class ImageFiles:
         if errors:
             first = next(iter(errors))
             console.warning("%d images cannot be read, others were shown: %s", len(errors), first)
+
+
+def _leave_signal(worker: int) -> None:
+    """Leave SIGTERM to the main process, also if a job sends it to all processes."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
 
 
 class _Reader(Dataset[tuple[Tensor, ReadErrors]]):

@@ -15,7 +15,7 @@ from renderer.errors import InputError
 from train.data.photo import DESCRIPTION
 from train.results import compare
 from train.results.compare import Difference
-from train.results.metrics import Pool
+from train.results.metrics import CLASS_RATE, Pool
 from train.results.pictures import Picture, read_square
 from train.results.predictions import Predictions
 from train.results.store import RunSummary
@@ -160,15 +160,16 @@ def compare_networks(
     pool = after[0].pooled.all
     labels = pool.predictions.labels
     label = join_words([in_words(item) for item in labels], "or")
+    each, rate = "", "false_positive_rate"
+    if len(labels) > 1:
+        each, rate = ", mean over these classes", CLASS_RATE
     metrics = {
         "recall": (f"Images of {label} recognized", "higher is better"),
-        "false_positive_rate": (f"Other objects called {label}", "lower is better"),
+        rate: (f"Other objects called {label}{each}", "lower is better"),
         "auc": ("Ranking quality (AUC)", "higher is better; 0.5 is chance"),
     }
     reasons = {EQUAL_RATE: "At an equal rate of 10% false positives, recall"}
-    each = ""
-    if len(labels) > 1:
-        each = ", mean over these classes"
+    if each:
         metrics["class_top1"] = ("Top-1 among all classes, mean over classes", "higher is better")
         reasons["class_top1"] = "Among all classes of the network, top-1 (the mean over classes)"
     # Difference after minus before of each metric. None if it is unknown.
@@ -176,7 +177,7 @@ def compare_networks(
         metric: compare.difference(after, before, compare.ALL, metric)
         for metric in (*metrics, EQUAL_RATE)
     }
-    recall, mistaken, auc = gains["recall"], gains["false_positive_rate"], gains["auc"]
+    recall, mistaken, auc = gains["recall"], gains[rate], gains["auc"]
     if recall is None or mistaken is None or auc is None:
         return None
     numbers = []

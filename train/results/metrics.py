@@ -27,6 +27,8 @@ AT_THRESHOLD: tuple[str, ...] = ("recall_at_threshold", "false_positive_rate_at_
 # Top-1 and top-5 accuracy among all classes of the network, as means over classes.
 # The value is the largest rank of the true class that counts as correct.
 TOP_RANKS = {"class_top1": 1, "class_top5": 5}
+# Name of the false-positive rate as a mean over several positive classes.
+CLASS_RATE = "class_false_positive_rate"
 # Names of the metrics that are fractions of images. The table of an evaluation shows
 # them in this order.
 FRACTION_METRICS: tuple[str, ...] = ("recall", "top5", "false_positive_rate", *AT_THRESHOLD)
@@ -102,6 +104,8 @@ class Metrics:
             over the classes of the images. Images of classes that the network
             lacks do not count. None if all images are of such classes.
         class_top5: Top-5 accuracy, computed like `class_top1`.
+        class_false_positive_rate: False-positive rate as a mean over the
+            positive classes. None if there is one.
     """
 
     n: int = 0
@@ -114,6 +118,7 @@ class Metrics:
     recall_at: Mapping[str, Estimate] = field(default_factory=dict)
     class_top1: Estimate | None = None
     class_top5: Estimate | None = None
+    class_false_positive_rate: Estimate | None = None
 
     def find(self, name: str) -> Estimate | None:
         """Return a metric by its name.
@@ -247,7 +252,7 @@ class Pool(ShortRepr):
         area = auc.value, auc.low, auc.high, auc.over
         auc_with_counts = AreaUnderCurve(*area, *positives, *negatives)
         recall_at = dict(zip(RATES, recalls, strict=True))
-        others: dict[str, Any] = {name: known.get(name) for name in TOP_RANKS}
+        others: dict[str, Any] = {name: known.get(name) for name in (*TOP_RANKS, CLASS_RATE)}
         others |= {name: outcome.proportion for name, outcome in self.outcomes.items()}
         return Metrics(n=len(self.predictions), auc=auc_with_counts, recall_at=recall_at, **others)
 
@@ -272,6 +277,11 @@ class Pool(ShortRepr):
         if all(map(len, self.ranked)):
             of_roc = intervals.leave_out_of_roc(*self.scores, choose_units(*self.ranked))
             jackknives.update(zip(ROC_METRICS, of_roc, strict=True))
+        negatives = self.negatives
+        if len(negatives) and len(self.predictions.labels) > 1:
+            hits = self.outcomes["false_positive_rate"].hits[None]
+            statistic = partial(intervals.class_means, hits, negatives.label.tolist())
+            (jackknives[CLASS_RATE],) = leave_out(statistic, choose_units(negatives))
         # One prediction for each image of a class of the network.
         images = self.classified
         if len(images):

@@ -222,10 +222,21 @@ def test_an_audit_killed_as_it_removes_results_leaves_no_part_of_them(tmp_path, 
     with monkeypatch.context() as patch:
         patch.setattr(audit.shutil, "rmtree", lambda folder, **_: folder.exists() and stop())
         with pytest.raises(KeyboardInterrupt):
-            audit._prepare_folder(settings, out, out / "renders")
+            audit._prepare_folder(settings, out, out / "renders", {})
     assert not (out / "classifier").exists()
-    audit._prepare_folder(settings, out, out / "renders")
+    audit._prepare_folder(settings, out, out / "renders", {})
     assert [path.name for path in out.iterdir()] == ["config.yaml"]
+
+
+def test_an_audit_does_not_go_on_with_other_weights(given, tmp_path):
+    linear = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(3 * 8**2, 2))
+    networks = {audit.CLASSIFIER: augment.Classifier(linear, 8, CLASSES)}
+    prepared = AuditSettings(**given), tmp_path / "audit", tmp_path / "audit/renders"
+    audit._prepare_folder(*prepared, networks)
+    audit._prepare_folder(*prepared, networks | {audit.HARDENED: guessing()})
+    linear[1].bias.data[0] += 1e-3
+    with pytest.raises(InputError, match="other weights"):
+        audit._prepare_folder(*prepared, networks)
 
 
 @pytest.fixture

@@ -118,3 +118,11 @@ def test_without_scored_images_the_first_screen_shows_both_networks_in_one_light
     assert screen.names == [CLASSIFIER, HARDENED]
     found = [(shown.before.value, shown.after.value) for shown in screen.numbers]
     assert found == [(2 / 5, 4 / 5), (0 / 2, 4 / 4)]
+
+
+@pytest.mark.parametrize("source", [None, "my_desk"])
+def test_a_photograph_is_described_by_its_class_and_its_source_if_that_is_known(tmp_path, source):
+    save_plain(tmp_path / "other_ball" / "000.png", 0)
+    predictions = ranked(["other_ball"], [[2.0, 0.0]], ["orange", "lemon"], sources=[source])
+    subject = page._draw(predictions, 0, tmp_path).alt.partition(":")[0]
+    assert subject == ("ball, my desk" if source else "ball")

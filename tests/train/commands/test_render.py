@@ -68,6 +68,12 @@ def test_parts_without_a_render_of_a_class_number_the_classes_alike(meshes, tmp_
     assert parts[0].class_to_idx == parts[1].class_to_idx == {"ball": 0, "box": 1}
 
 
+def test_an_object_that_is_drawn_without_a_label_is_named(meshes, tmp_path, caplog):
+    box, ball = meshes
+    write([box | {"others": [{"mesh": ball["mesh"]}, ball]}], tmp_path / "out", count=1, maps=[])
+    assert caplog.text.count(ball["mesh"]) == 1
+
+
 def test_torchvision_reads_the_classes_of_folders(written):
     for part, count in {"train": 7, "val": 4}.items():
         found = ImageFolder(str(written / part))

@@ -1,3 +1,5 @@
+import multiprocessing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -62,6 +64,14 @@ def test_crops_are_parts_of_the_image_by_their_seeds_whatever_the_number_of_proc
     assert 0.31 < areas.min() < 0.45  # The smallest crops have 35 % of the area.
     assert 0.9 < areas.max() <= 1
     assert (torch.stack(spans) > 0).all()  # No crop is mirrored or upside down.
+
+
+def test_a_signal_that_all_processes_of_a_job_get_does_not_end_those_that_read_images(files):
+    reading = replace(files, workers=1).squares(torch.zeros(40, 1, dtype=torch.int64))
+    images = [next(reading)]
+    for process in multiprocessing.active_children():
+        process.terminate()
+    assert len([*images, *reading]) == 40
 
 
 def test_reading_images_draws_nothing_from_the_global_generator(files):

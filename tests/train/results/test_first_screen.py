@@ -56,3 +56,16 @@ def test_an_image_of_no_class_under_study_is_counted_once_for_all_classes():
     others = [shown for shown in SHOWN if shown not in LABELS]
     assert int(counts[0]) == len(SHOWN) - len(others)
     assert int(counts[1]) == len(others)
+
+
+def test_false_calls_of_several_classes_are_means_over_the_classes():
+    """Without the last image, 4 images show no banana, and 3 no mug."""
+    before, after = (
+        [evaluation_of(predictions[predictions.source != "source 5"])]
+        for predictions in map(predictions_of, (BEFORE, AFTER))
+    )
+    screen = compare_networks(before, after, ("before", "after"))
+    means = [(0 / 4 + 2 / 3) / 2, (2 / 4 + 0 / 3) / 2]
+    shown = screen.numbers[1]
+    assert [shown.before.value, shown.after.value] == pytest.approx(means)
+    assert re.findall(r"\d+%", screen.sentences[1]) == [f"{mean:.0%}" for mean in means]

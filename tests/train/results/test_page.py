@@ -10,7 +10,7 @@ from PIL import Image
 from train.results.page import images_folder, report_of, write_report
 from train.results.store import RunSummary
 from train.run_config import write_config
-from train.run_folder import locked
+from train.run_folder import LOCK, locked
 
 HOSTILE = "<script>alert(1)</script>|*x*"
 
@@ -30,6 +30,9 @@ def write_unfinished_runs(folder: Path) -> None:
     (folder / "going" / "metrics.jsonl").write_text(lines)
     (folder / "damaged" / "metrics.jsonl").write_bytes(b"\xff{\n")
     (folder / "failed" / "failed.txt").write_text(HOSTILE)
+    shutil.copytree(folder / "weights", folder / "closed")
+    # A folder of this name cannot be locked, as no file can be in a read-only folder.
+    (folder / "closed" / LOCK).mkdir()
 
 
 SUCCESSFUL_EXAMPLE = {
@@ -83,6 +86,7 @@ def test_runs_in_every_state_are_shown_or_named(page):
     rows = rows_of(page)
     states = {Path(cells[0]).name: cells[1:] for cells in rows if cells and "/" in cells[0]}
     assert states["going"] == ["interrupted", "2"]
+    assert states["closed"] == ["not finished", "0"]
     assert states["weights"] == ["interrupted", "0"]
     assert states["failed"] == [f"failed: {HOSTILE}", "0"]
     assert states["begun"] == ["in training", "0"]
