@@ -292,7 +292,7 @@ def _groups_of_file(
 
     `first` and `second` are the corners of neighboring faces (see `_neighbors`). Corners of faces
     that only touch at a vertex are compared, too, in the order of their normals. Faces of opposite
-    winding are in different groups, because their area vectors would cancel.
+    winding, which run along a common edge in the same direction, are in different groups.
     """
     lengths = np.linalg.norm(file_normals.astype(np.float64), axis=-1)
     is_given = (lengths > 0) & np.isfinite(lengths)
@@ -311,7 +311,13 @@ def _groups_of_file(
     first = np.concatenate([first, order[:-1][is_same_vertex]])
     second = np.concatenate([second, order[1:][is_same_vertex]])
     cosines = np.einsum("ni,ni->n", unit_normals[first], unit_normals[second])
-    agree = (cosines >= np.cos(np.radians(FILE_ANGLE))) & (side[first] * side[second] >= 0)
+    agree = cosines >= np.cos(np.radians(FILE_ANGLE))
+    count = vertex.max() + 1
+    edges, counts = np.unique(
+        vertex * count + np.roll(faces, -1, axis=1).ravel(), return_counts=True
+    )
+    is_mixed = np.isin(np.arange(count), np.divmod(edges[counts > 1], count))
+    agree &= ~is_mixed[vertex[first]] | (side[first] * side[second] >= 0)
     return _joined(faces, first[agree], second[agree]), is_given
 
 

@@ -491,10 +491,14 @@ def expose(scene: Scene) -> Scene:
             middle = (low + high) / 2
             mean = encode(clamp(values * 2**middle + local), scene.settings.encoding).mean()
             low, high = (middle, high) if mean < aim else (low, middle)
-        # Nothing brightens what is black.
-        factors.append(2**low if lit else 1.0)
+        # Nothing brightens what is black, and without environment light, the mean may be above.
+        is_above = low == -STOPS
+        factors.append(2**low if lit and not is_above else 1.0)
         if rows:
-            say_once(f"{item.name}: exposure={factors[-1]:.3g}, at which its mean is {aim:.2g}")
+            mean = encode(clamp(values * factors[-1] + local), scene.settings.encoding).mean()
+            said = f"{item.name}: exposure={factors[-1]:.3g}, at which its mean is {mean:.2g}"
+            reason = f", because projector and lamps alone exceed {aim:.2g}: lower their power"
+            say_once(said + reason * is_above)
     examples = [
         replace(example, exposure=example.exposure * factors[example.object])
         for example in scene.examples

@@ -12,7 +12,7 @@ from oracles import corners_of, mesh_of
 
 import norm_balls as nb
 from renderer.mesh import concatenate, refine, select_faces, subdivide, transformed
-from renderer.normals import normal_groups
+from renderer.normals import doubled_area_vectors, normal_groups
 
 CAN = mesh_of(trimesh.creation.cylinder(0.5, 1.2, sections=48), (0.8, 0.7, 0.6))
 
@@ -130,6 +130,17 @@ def test_faces_that_a_file_winds_the_other_way_keep_its_normals():
         :, None
     ]
     assert cosines.min() > np.cos(np.radians(6))
+
+
+def test_a_crumpled_surface_keeps_the_normals_of_a_file():
+    """As after an attack on the shape: some faces look away from the normals of their corners."""
+    ball = trimesh.creation.icosphere(4)
+    shifts = np.random.default_rng(0).uniform(-0.1, 0.1, ball.vertices.shape)
+    mesh = nb.Mesh.plain(ball.vertices + shifts, ball.faces)
+    normals = replace(mesh, normal_ids=ball.faces).corner_normals
+    sides = np.einsum("fci,fi->fc", normals, doubled_area_vectors(mesh.vertices, mesh.faces))
+    assert (sides < 0).any()
+    assert is_same_partition(normal_groups(mesh.vertices, mesh.faces, normals), ball.faces)
 
 
 @pytest.mark.parametrize("noise", [1e-7, 1e-4, 5e-3])

@@ -244,6 +244,7 @@ def difference_table(methods: Evaluations, *properties: str) -> Table:
 
 def run_tables(methods: Methods) -> list[Table]:
     """Make tables of the accuracy and the settings of runs."""
+    title_of_accuracies, methods = _accuracies(methods)
     every_run = [run for runs in methods.values() for run in runs]
     lines: dict[str, list[Line]] = {
         method: [(run.seed, [Estimate(run.accuracy)]) for run in runs]
@@ -253,7 +254,7 @@ def run_tables(methods: Methods) -> list[Table]:
     # A dictionary has each name once, in the order of the runs.
     names = dict.fromkeys(run.config.get("test_images", "") for run in every_run)
     title = " or ".join(f"accuracy on {name}" for name in names if name)
-    tables = [_run_table(title, [_accuracy_title(every_run)], lines)]
+    tables = [_run_table(title, [title_of_accuracies], lines)]
     # The first run of each method. Networks without a run have no settings of a training.
     heads = {method: runs[0] for method, runs in methods.items() if runs[0].seed is not None}
     # Titles of the settings in which the runs differ, by their keys.
@@ -265,13 +266,22 @@ def run_tables(methods: Methods) -> list[Table]:
     return [*tables, Table("settings in which the methods differ", header, rows)]
 
 
-def _accuracy_title(runs: Sequence[RunSummary]) -> str:
-    """Return the title of the column with the accuracy of runs on their test images.
+def _accuracies(methods: Methods) -> tuple[str, Methods]:
+    """Return the title of the column of accuracies on test images, and runs that have only these.
 
     Images without labels are labeled with the predictions of the network before the training.
+    Their runs lose the accuracy beside runs of images with labels.
     """
-    names = {run.config.get("data", {}).get("name") for run in runs if run.config}
-    return "agreement with the original" if names == {UNLABELED} else "test accuracy"
+
+    def images(run: RunSummary) -> str | None:
+        return run.config.get("data", {}).get("name")
+
+    if {images(run) for runs in methods.values() for run in runs if run.config} == {UNLABELED}:
+        return "agreement with the original", methods
+    return "test accuracy", {
+        method: [replace(run, accuracy=None) if images(run) == UNLABELED else run for run in runs]
+        for method, runs in methods.items()
+    }
 
 
 def score_table(title: str, group: Scored) -> Table:
@@ -343,7 +353,8 @@ def format_short_comparison(runs: Sequence[RunSummary], by: str = "source") -> s
         return str(group_table(evaluations, by).without_unknown_columns)
     first = next(iter(evaluations), None)
     rows = []
-    for method, runs_of_method in methods.items():
+    title_of_accuracies, with_accuracies = _accuracies(methods)
+    for method, runs_of_method in with_accuracies.items():
         shown = [_mean(Estimate(run.accuracy) for run in runs_of_method)]
         of_method = [item.scores.overall for item in group.get(method, ())]
         shown += [_mean(metrics.find(name) for metrics in of_method) for name in SHORT_METRICS]
@@ -357,5 +368,5 @@ def format_short_comparison(runs: Sequence[RunSummary], by: str = "source") -> s
             count = f"{len(of_method)} scored of {count}"
         rows.append([method, count, *values, format_interval(gain, sign="+")])
     titles = [TITLES[name] for name in SHORT_METRICS]
-    header = ["network", "runs", _accuracy_title(runs), *titles, "gain in AUC [95%]"]
+    header = ["network", "runs", title_of_accuracies, *titles, "gain in AUC [95%]"]
     return str(Table(title, header, rows).without_unknown_columns)

@@ -237,6 +237,14 @@ def score(
     odds = estimate(false_odds, [np.arange(joined.image_count)], units)
     ends = (odds.value, odds.low, odds.high)
     value, low, high = (None if end is None else end / (1 - end) for end in ends)
+    is_false = (joined.score >= threshold) & ~joined.is_right
+    numbers = np.bincount(joined.image[is_false], minlength=joined.image_count)
+    if low is not None and numbers.any() and not np.ptp(numbers):
+        from scipy.special import gammaincinv
+
+        # No variance is known, so the interval is that of Poisson for the total number.
+        total = numbers.sum()
+        low, high = gammaincinv([total, total + 1], [0.025, 0.975]) / joined.image_count
     false_detections = Estimate(value, low, high, odds.over)
     return DetectionMetrics(len(joined.object_score), recall, precision, false_detections)
 

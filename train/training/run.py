@@ -229,8 +229,9 @@ class Run:
                 self._recognize()
         if log:  # Only the first process has a log.
             scores |= self._score_photographs(trainer.selected, self.folder)
-            log.scalars(scores)
             self._export()
+            # A run with scores counts as finished.
+            log.scalars(scores)
         return scores
 
     def _export(self) -> None:

@@ -84,6 +84,16 @@ def test_the_automatic_exposure_makes_the_mean_of_an_object_two_fifths(light, en
     assert scene.examples[0].exposure != scene.examples[3].exposure
 
 
+def test_a_light_of_no_exposure_keeps_its_own_beside_lamps_that_are_too_bright(caplog):
+    lamps = LampsSettings([[3.0, 0.0, 3.0]], start=50.0, power=100.0)
+    entries = [("solid:orange", "orange")]
+    scene = build_scene(entries, 24, lamps=lamps, exposure="auto", backgrounds=[0.0])
+    assert scene.examples[0].exposure == 1
+    mask = scene.truth(lambda label: 0).masks[0, 0, 0]
+    mean = float(images_of(scene)[0][:, mask].mean())
+    assert mean > 0.4 and f"its mean is {mean:.2g}, because projector and lamps" in caplog.text
+
+
 def test_the_automatic_exposure_leaves_the_projector_within_its_power_and_its_radius(tmp_path):
     dark = ObjectSettings(mesh="solid:orange:7", label="orange", albedo_scale=0.2)
     projector = ProjectorSettings(pixels=4, polar=45.0)

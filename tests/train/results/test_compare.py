@@ -60,6 +60,17 @@ def scored_run(tmp_path, made_up_run, monkeypatch) -> Callable[..., Path]:
     return make
 
 
+def test_agreement_with_the_original_is_no_test_accuracy(scored_run):
+    labeled = scored_run("none", STUDIO_AND_WEB)
+    other = scored_run("random", STUDIO_AND_WEB, "data=unlabeled", f"unlabeled={labeled}")
+    for folders, accuracies in (([labeled, other], 1), ([labeled], 1), ([other], 1)):
+        text = comparison.format_short_comparison([summarize(folder) for folder in folders])
+        title = "test accuracy" if labeled in folders else "agreement with the original"
+        (rows,) = read_markdown(text).values()
+        column = rows[0].index(title)
+        assert sum(row[column] != "-" for row in rows[1:]) == accuracies
+
+
 def compare(folders: list[Path]) -> dict[str, list[list[str]]]:
     """Read the tables that compare the runs in some folders, by the title before the intervals."""
     tables = read_markdown(comparison.format_comparison([summarize(folder) for folder in folders]))

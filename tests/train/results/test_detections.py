@@ -3,6 +3,7 @@ import io
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 
 from train.results import detections
 from train.results.detections import Found, Marked
@@ -154,6 +155,15 @@ def test_fewer_than_three_photographs_have_no_interval(count):
     assert metrics.false_per_image.value == pytest.approx((count - 1) / count)
     for metric in (metrics.recall, metrics.ap50, metrics.false_per_image):
         assert (metric.low is None) == (metric.high is None) == (count < 3)
+
+
+@pytest.mark.parametrize("number", [1, 200])
+def test_an_equal_number_of_false_detections_in_all_photographs_has_the_interval_of_poisson(number):
+    far = _found([[60, 60, 80, 80]] * number, [0] * number, [0.9] * number)
+    found = detections.score(_match([far] * 20, [_marked(BOX, [0])] * 20), [0], 0.4).false_per_image
+    # Garwood 1936, by quantiles of χ².
+    low, high = chi2.ppf([0.025, 0.975], [40 * number, 40 * number + 2]) / 40
+    assert (found.value, found.low, found.high) == pytest.approx((number, low, high))
 
 
 def test_no_false_detection_has_an_upper_limit_like_the_rule_of_three():
