@@ -97,6 +97,7 @@ def scene_with(item: SceneObject) -> Scene:
     return scene.changed(objects=[item])
 
 
+@pytest.mark.filterwarnings("ignore:.*takes light of degree")
 @pytest.mark.parametrize(
     ("kinds", "encoding"),
     [
