@@ -238,8 +238,8 @@ def transfer(
                 options: dict[str, Any] = {"dtype": images.dtype, "size_from": "the attack"}
                 name = f"classifiers[{index}]"
                 classifier = as_network(network, *given, name, task=attacked.task, **options)
-            resized = partial(_resized, size=classifier.size)
-            rows.append({"network": classifier.name, **classify(classifier, resized)})
+            change = partial(resized, size=classifier.size)
+            rows.append({"network": classifier.name, **classify(classifier, change)})
     for azimuth in azimuths:
         turned = partial(_turned, angle=azimuth)
         rows.append({"azimuth": f"{azimuth:+g}°", **classify(attacked, turned)})
@@ -419,7 +419,7 @@ def _classify(
     }
 
 
-def _resized(adversary: Adversary, size: Size) -> Adversary:
+def resized(adversary: Adversary, size: Size) -> Adversary:
     """Return a copy of an adversary whose images have another size."""
     if adversary.settings.size == size:
         return adversary

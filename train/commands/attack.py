@@ -8,7 +8,7 @@ import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from jaxtyping import Bool
 from augment.attack_settings import AttackSettings, RelightingSettings
 from augment.attacks.adversary import Adversary, reload
 from augment.attacks.attack import attack, find_scene
-from augment.attacks.checks import check, require_transferable, success_by_radius, transfer
+from augment.attacks.checks import check, require_transferable, resized, success_by_radius, transfer
 from augment.attacks.files import require_renderers, save
 from augment.attacks.objective import Objective
 from augment.attacks.result import ZERO_GRADIENT, AttackResult, warnings
@@ -36,6 +36,7 @@ from renderer.errors import InputError, keyed, keys_of
 from renderer.io.files import atomic_write
 from renderer.settings import Size
 from renderer.visibility import Rasterizer
+from train import console
 from train.auditing.lights import criterion_of
 from train.auditing.relit import MODELED, attack_folder
 from train.checkpoints import load_chosen, load_network
@@ -222,6 +223,12 @@ def attacks(
     if adversary is not None:
         if adversary.pixels is not None:
             raise InputError(f"reload={settings.reload} has changed pixels: give another")
+        if settings.attack.skylight:
+            console.warning("the sky starts at attack.skylight: saved adversaries have no sun")
+        # An attack on the pose needs them, and images stay the same.
+        silhouettes = adversary.settings.silhouettes or settings.renderer.silhouettes
+        shown = replace(adversary.settings, silhouettes=silhouettes)
+        adversary = replace(adversary, settings=shown)
         # The saved adversary has its own scene, which may be misclassified already.
         scene = adversary.scene(choose_rasterizer(settings.renderer), device)
         yield adversary.shown.name, settings.scene, start(scene, force=True)
@@ -309,9 +316,12 @@ def format_reloaded(
 ) -> list[str]:
     """Render a reloaded adversary again, and describe what a network finds in its views.
 
-    Each line has the prediction, and the largest difference from the saved image.
+    Each line has the prediction, and the largest difference from the saved image. A network of
+    another size gets a render of that size.
     """
     device = device_of(classifier)
+    saved = adversary.images_in_views
+    adversary = resized(adversary, classifier.size or adversary.settings.size)
     images = adversary.render_views(rasterizer).to(device)
     label = adversary.shown.label
     # A classifier need not know the class.
@@ -319,14 +329,18 @@ def format_reloaded(
     criterion = criterion_of(classifier, adversary.scene(rasterizer, device), known)
     # `images[None]` is one example with V views. Evidence has the shape (1, V, K).
     evidence = Objective(classifier, criterion, settings, seed=0).evidence(images[None])
-    difference = images - adversary.images_in_views.to(images)
-    levels = (255 * difference.abs().flatten(1).amax(1)).tolist()
+    height, width = images.shape[-2:]
+    compared = [f"rendered again at {height} × {width} pixels"] * len(images)
+    if images.shape == saved.shape:
+        levels = (255 * (images - saved.to(images)).abs().flatten(1).amax(1)).tolist()
+        compared = [
+            f"values differ from the saved image's by {one:.3g}/255 at most" for one in levels
+        ]
     named = classifier.task.found(evidence[0], criterion.predicted(evidence)[0], classifier.classes)
     return [
         f"view {view}: {label} is recognized as {named['predicted'][view]} "
-        f"({named['confidence'][view]:.1%}); "
-        f"values differ from the saved image's by {level:.3g}/255 at most"
-        for view, level in enumerate(levels)
+        f"({named['confidence'][view]:.1%}); {comparison}"
+        for view, comparison in enumerate(compared)
     ]
 
 

@@ -11,6 +11,7 @@ import pytest
 from omegaconf import OmegaConf
 
 import norm_balls as nb
+from augment.classifier import as_network
 from renderer.visibility import choose
 from tests.helpers import find_red
 from train.commands.attack import WITHOUT_NOISE, format_reloaded, write_transfers
@@ -89,6 +90,9 @@ def test_an_adversary_of_two_views_is_rendered_again_and_attacked_further(run, t
     (again,) = read_lines(tmp_path / "again" / FOLDER_OF_ORANGE / "attack.jsonl")
     assert again["predicted_before"] == line["predicted"]
     assert again["cost_before"] == pytest.approx(line["cost"], abs=0.05)
+    assert run(reload, "attack=pose", *WITHOUT_CHECKS, "out=turned") == 0
+    (turned,) = read_lines(tmp_path / "turned" / FOLDER_OF_ORANGE / "attack.jsonl")
+    assert turned["cost_before"] == pytest.approx(line["cost"], abs=0.05)
 
 
 @pytest.mark.slow
@@ -104,6 +108,9 @@ def test_an_adversary_of_a_detector_is_rendered_and_detected_again(tmp_path):
         (text,) = format_reloaded(*reloaded)
         expected = f"recognized as {line['predicted'][0]} ({line['confidence'][0]:.1%})"
         assert expected in text
+        larger = as_network(find_red, 48, ["orange", "apple"])
+        (text,) = format_reloaded(adversary, choose("auto"), larger, result.settings)
+        assert text.endswith("at 48 × 48 pixels")
     assert {line["predicted"][0] for line in lines} == {"nothing"}
 
 
