@@ -6,6 +6,7 @@ dict), `architecture` (what rebuilds the network, see `train.networks.describe`)
 last.pt has all of `train.training.loop.Trainer.state_dict`.
 """
 
+import hashlib
 import io
 import json
 from collections.abc import Mapping
@@ -369,3 +370,11 @@ def _load_published(path: Path) -> dict[str, Any]:
             # Earlier versions stored a single operating point instead of a list.
             facts["operating_point"] = [points]
         return _checked({**facts, "model": weights})
+
+
+def hash_weights(state: Mapping[str, Any]) -> str:
+    """Compute the SHA-256 of the weights of a network, which need not come from an input file."""
+    digest = hashlib.sha256()
+    for tensor in (value for value in state.values() if isinstance(value, Tensor)):
+        digest.update(tensor.detach().cpu().flatten().view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()

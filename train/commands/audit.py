@@ -10,7 +10,6 @@ The folder of the audit has a subfolder of results for each network. The names o
 the subfolders are CLASSIFIER and HARDENED.
 """
 
-import hashlib
 import math
 import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from augment.attack_settings import RelightingSettings
 from augment.classifier import UNIT_RANGE, Classifier, Normalization, TaskNetwork, as_network
@@ -38,7 +37,7 @@ from train import class_names, console, run_folder
 from train.auditing import lights, page, relit
 from train.auditing import network as audited
 from train.auditing.network import CLASSIFIER, HARDENED, IN_WORDS, AuditReport
-from train.checkpoints import load_chosen, load_network
+from train.checkpoints import hash_weights, load_chosen, load_network
 from train.command_settings import ENVIRONMENTS, AuditSettings, LabSettings
 from train.data.annotations import read_annotations
 from train.data.photo import DESCRIPTION
@@ -496,7 +495,7 @@ def _prepare_folder(settings: AuditSettings, out: Path, renders: Path, networks:
     With `settings.overwrite`, the results of an earlier audit are removed.
     Otherwise an earlier audit in the folder must have the same settings and weights.
     """
-    hashes = {key: _hash_weights(network) for key, network in networks.items()}
+    hashes = {key: hash_weights(network.state_dict()) for key, network in networks.items()}
     if settings.overwrite:
         folders = (key + end for key in (CLASSIFIER, HARDENED) for end in ("", lights.NORMALIZED))
         (out / PAGE).unlink(missing_ok=True)
@@ -517,14 +516,6 @@ def _prepare_folder(settings: AuditSettings, out: Path, renders: Path, networks:
                 fault = f"{networks[key].name} has other weights than when {out} began"
                 raise InputError(f"{fault}: set another out=, or overwrite=true")
     write_config(out, settings, command=command_line("audit"), hashes=hashes)
-
-
-def _hash_weights(network: nn.Module) -> str:
-    """Compute the SHA-256 of the weights of a network, which no input file may contain."""
-    digest = hashlib.sha256()
-    for tensor in (*network.parameters(), *network.buffers()):
-        digest.update(tensor.detach().cpu().flatten().view(torch.uint8).numpy().tobytes())
-    return digest.hexdigest()
 
 
 def _write_renders(settings: AuditSettings, plan: _Plan, size: Size, out: Path) -> None:

@@ -106,11 +106,12 @@ def choose_labels(
 ) -> list[str]:
     """Choose the positive classes, on whose photographs recall is measured.
 
-    None chooses all classes of the network that have a sub-folder.
+    None chooses all classes of the network that have a sub-folder with images.
     """
     if label is not None:
         return [classes[class_index(classes, name, "label")] for name in label_names(label)]
-    labels = class_folders(folder, classes)
+    shown = {composed(path.parts[0]) for path in _image_files(folder)[0]}
+    labels = sorted(name for name in classes if composed(name) in shown)
     if not labels:
         fault = f"photos={folder} has no sub-folder named by a class, such as {classes[0]}"
         raise InputError(f"{fault}: rename them, or give classes or label")

@@ -98,6 +98,10 @@ class Run:
                 advice = "set train.resume=true or overwrite=true, or another folder"
                 raise InputError(f"out={folder} holds a run already: {advice}")
         self._is_resumed = earlier is not None
+        self._hashes = {"network": checkpoints.hash_weights(initial.weights)} if initial else {}
+        if earlier is not None and self._hashes != (earlier.get("hashes") or self._hashes):
+            fault = f"network={settings.network} has other weights than when {folder} began"
+            raise InputError(f"{fault}: put them back, or set another out=")
         # The number of threads changes the last bits of the results, so a resumed run keeps it.
         known = None if earlier is None else OmegaConf.select(earlier, "hardware.threads")
         threads = settings.train.threads or known
@@ -202,7 +206,8 @@ class Run:
         images = self._inputs.describe(model, self.data.size)
         test_images = inputs.describe_test_images(self.settings, self.data)
         facts = {"hardware": hardware, "command": self.command}
-        write_config(self.folder, self.settings, **facts, images=images, test_images=test_images)
+        facts |= {"images": images, "test_images": test_images, "hashes": self._hashes}
+        write_config(self.folder, self.settings, **facts)
 
     def train(self, logger: Logger | None = None) -> dict[str, float]:
         """Train to the last epoch, score the network, and return the final scores by name.

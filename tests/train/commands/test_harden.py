@@ -90,6 +90,13 @@ def test_the_weights_are_those_of_the_command(network, photographs, tmp_path, mo
     assert all(value.equal(expected[name]) for name, value in hardened.state_dict().items())
     written = torch.load(tmp_path / "hardened" / "weights.pt")
     assert all(value.equal(expected[name]) for name, value in written.items())
+    other = deepcopy(network)
+    other[4].weight.data[0] += 1e-3
+    resumed = {"out": tmp_path / "hardened", "train": SHORT["train"] | {"resume": True}}
+    again = harden(network, photographs, **resumed)
+    assert all(value.equal(expected[name]) for name, value in again.state_dict().items())
+    with pytest.raises(nb.InputError, match="other weights"):
+        harden(other, photographs, **resumed)
 
 
 @pytest.mark.parametrize(

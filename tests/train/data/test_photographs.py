@@ -61,6 +61,12 @@ def test_images_are_found_with_their_class_in_sorted_order(tmp_path, files, expe
     assert " ".join(map(":".join, find(touch(tmp_path, *files.split())))) == expected
 
 
+def test_a_folder_without_photographs_is_no_positive_class(tmp_path):
+    touch(tmp_path, "orange/a.png", "pear/b.png", "apple/notes.txt")
+    (tmp_path / "lemon").mkdir()
+    assert photographs.choose_labels(tmp_path, [*CLASSES, "lemon"], None) == ["orange", "pear"]
+
+
 def test_links_to_folders_and_files_are_followed_but_not_in_circles(tmp_path):
     touch(tmp_path, "elsewhere/deep/a.jpg", "elsewhere/b.jpg", "photos/pear/c.jpg")
     photos = tmp_path / "photos"
