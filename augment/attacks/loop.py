@@ -194,9 +194,10 @@ def _minimize_group(
         result.queries[rows[checked]] += noisy_count
         is_success = latest.success.clone()
         with frozen_eval_mode(objective.model):
-            part, shown = objective.select(rows[checked]), examples[rows[checked]]
-            moved = part.moved(optimizer.problem, latest.values[checked], shown)
-            is_success[checked] = moved.is_robust(latest.images[checked], shown)
+            if len(checked):
+                part, shown = objective.select(rows[checked]), examples[rows[checked]]
+                moved = part.moved(optimizer.problem, latest.values[checked], shown)
+                is_success[checked] = moved.is_robust(latest.images[checked], shown)
         rows = rows[~is_success]
         if not len(rows):
             break

@@ -491,8 +491,8 @@ def expose(scene: Scene) -> Scene:
             middle = (low + high) / 2
             mean = encode(clamp(values * 2**middle + local), scene.settings.encoding).mean()
             low, high = (middle, high) if mean < aim else (low, middle)
-        # Nothing brightens what is black, and without environment light, the mean may be above.
-        is_above = low == -STOPS
+        # Nothing brightens what is black, and nothing darkens projector and lamps.
+        is_above = lit > 0 and low == -STOPS
         factors.append(2**low if lit and not is_above else 1.0)
         if rows:
             mean = encode(clamp(values * factors[-1] + local), scene.settings.encoding).mean()

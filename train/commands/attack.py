@@ -229,6 +229,7 @@ def attacks(
         silhouettes = adversary.settings.silhouettes or settings.renderer.silhouettes
         shown = replace(adversary.settings, silhouettes=silhouettes)
         adversary = replace(adversary, settings=shown)
+        adversary = resized(adversary, classifier.size or adversary.settings.size)
         # The saved adversary has its own scene, which may be misclassified already.
         scene = adversary.scene(choose_rasterizer(settings.renderer), device)
         yield adversary.shown.name, settings.scene, start(scene, force=True)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from oracles import draw, draw_uniform
+from oracles import draw, draw_uniform, mesh_of
 from PIL import Image
 
 import renderer
@@ -85,6 +85,8 @@ def test_the_automatic_exposure_makes_the_mean_of_an_object_two_fifths(light, en
 
 
 def test_a_light_of_no_exposure_keeps_its_own_beside_lamps_that_are_too_bright(caplog):
+    build_scene([(mesh_of(trimesh.creation.box(), (0, 0, 0)), "box")], 8, exposure="auto")
+    assert "its mean is 0\n" in caplog.text
     lamps = LampsSettings([[3.0, 0.0, 3.0]], start=50.0, power=100.0)
     entries = [("solid:orange", "orange")]
     scene = build_scene(entries, 24, lamps=lamps, exposure="auto", backgrounds=[0.0])

@@ -151,6 +151,10 @@ def test_noise_is_tested_where_an_attack_has_moved_the_object():
     settings = nb.AttackSettings(pose=pose, max_steps=30, margin=0.0, noise_margin=1.0)
     found = nb.attack(stays, scene, task=nb.Detection(0.2), settings=settings, classes=CLASSES)
     assert found.success.all() and found.minimum.steps < 15
+    # No noise is tested before a restart if the first start has no success.
+    weak = replace(settings, pose=replace(pose, radius=0.01), max_steps=1, restarts=1)
+    found = nb.attack(stays, scene, task=nb.Detection(0.2), settings=weak, classes=CLASSES)
+    assert not found.success.any() and found.minimum.steps == 2
 
 
 def test_a_task_with_another_goal_replaces_that_of_a_loaded_network():
