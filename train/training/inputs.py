@@ -368,7 +368,7 @@ def build_service(
     has_all = is_classifier and len(positive_classes) == len(data.classes)
     if has_all and (labels < 0).any():
         fault = f"label={settings.label} has all classes of the network, but some renders none"
-        raise InputError(f"{fault}: give all objects a label")
+        raise InputError(f"{fault}: give all objects a label, or set hard_negatives=[]")
     rendered = (settings.augment, scene, labels.to(device), settings.seed, phases)
     ranked = positive_classes if is_ranked else ()
     # Each process of a run renders its own share.
