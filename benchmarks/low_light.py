@@ -91,7 +91,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         write_photographs(others, objects, photographs)
 
     def for_dim(network: nn.Module) -> nn.Module:
-        return Switch(original, with_normalized_light(network, True), IsDim())
+        # Outside of `Sequential`, outputs of a switch count as decoded.
+        switch = Switch(original, with_normalized_light(network, True), IsDim())
+        return nn.Sequential(switch).eval()
 
     networks = {"original": original, "normalized light": with_normalized_light(original, True)}
     networks["normalized light, dim images alone"] = for_dim(original)

@@ -376,5 +376,7 @@ def hash_weights(state: Mapping[str, Any]) -> str:
     """Compute the SHA-256 of the weights of a network, which need not come from an input file."""
     digest = hashlib.sha256()
     for tensor in (value for value in state.values() if isinstance(value, Tensor)):
-        digest.update(tensor.detach().cpu().flatten().view(torch.uint8).numpy().tobytes())
+        # A copy, because the strides of tensors that were expanded do not permit the view.
+        copy = tensor.detach().cpu().flatten().clone(memory_format=torch.contiguous_format)
+        digest.update(copy.view(torch.uint8).numpy().tobytes())
     return digest.hexdigest()

@@ -13,6 +13,7 @@ from torch import Tensor
 from augment.attack_settings import LINES
 from augment.attacks.adversary import MITSUBA, Adversary, reload, save_lights, write_adversary
 from augment.attacks.objective import Images, as_jpeg
+from augment.attacks.parameters.lights import Skylight
 from augment.attacks.result import AttackResult, require_result, warnings
 from augment.progress import progress
 from augment.scene.objects import Conditions
@@ -150,6 +151,8 @@ def _write_example(
 
     classes = result.classifier.classes
     minimum = result.minimum
+    values = problem.split_by_parameter(minimum.values[[example]])
+    skies = [kind.described(part[0]) for kind, part in values if isinstance(kind, Skylight)]
     # Change of each of the D attack values of this example, shape (1, D).
     parts = problem.split_by_parameter(minimum.values[[example]] - problem.start[[example]])
     return {
@@ -161,6 +164,7 @@ def _write_example(
         **result.predictions(result.evidence_in_views_before[example], example, "_before"),
         **result.predictions(result.evidence_in_views[example], example),
         "largest_change": {parameter.name: float(part.abs().max()) for parameter, part in parts},
+        **({"sky": skies[0]} if skies else {}),
         **light_numbers,
         "versions": {},
     }

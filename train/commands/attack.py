@@ -224,7 +224,8 @@ def attacks(
         if adversary.pixels is not None:
             raise InputError(f"reload={settings.reload} has changed pixels: give another")
         if settings.attack.skylight:
-            console.warning("the sky starts at attack.skylight: saved adversaries have no sun")
+            line = "the sky starts at attack.skylight: give the values of sky in attack.jsonl there"
+            console.warning(line)
         # An attack on the pose needs them, and images stay the same.
         silhouettes = adversary.settings.silhouettes or settings.renderer.silhouettes
         shown = replace(adversary.settings, silhouettes=silhouettes)

@@ -117,6 +117,10 @@ class LocalLight(LightParameter):
 TURBIDITY_UNIT = 4.0
 
 
+# Attack values of a sky, and names of the settings with their initial values.
+SKY = "zenith", "azimuth", "turbidity"
+
+
 class Skylight(Parameter):
     """Attack on a daylight sky: zenith angle and azimuth of the sun, and turbidity (haze).
 
@@ -147,7 +151,7 @@ class Skylight(Parameter):
         self._window = nonnegative_window(HARMONICS.degree) if nonnegative else None
         self._sun = settings.sun
         units = torch.tensor([self._sun, self._sun, TURBIDITY_UNIT], dtype=torch.float64)
-        initial = units.new_tensor([settings.zenith, settings.azimuth, settings.turbidity])
+        initial = units.new_tensor([getattr(settings, name) for name in SKY])
         start = (initial / units).to(scene.lights)
         # The sky model is defined for all azimuths, but not for all zenith angles and turbidities.
         limits = units.new_tensor([ZENITH, (-math.inf, math.inf), TURBIDITY])
@@ -170,6 +174,14 @@ class Skylight(Parameter):
         missing_count = self._basis.size - sky.shape[-2]
         sky = F.pad(sky, (0, 0, 0, missing_count))
         return replace_light(conditions, self._rows, sky.to(conditions.light))
+
+    def described(self, values: Float[Tensor, " 3"]) -> dict[str, float]:
+        """Return zenith angle and azimuth in degrees, and turbidity, by name."""
+        units = self._sun, self._sun, TURBIDITY_UNIT
+        return {
+            name: value * unit
+            for name, value, unit in zip(SKY, values.tolist(), units, strict=True)
+        }
 
 
 class Positions(Parameter):

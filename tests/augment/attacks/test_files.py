@@ -16,9 +16,21 @@ from augment.attacks.result import AttackResult, warnings
 from renderer.io.images import GAP, LINE_HEIGHT, MARGIN, TITLE_HEIGHT
 from renderer.light.environment import read_map, to_map
 from renderer.light.files import load_light
+from renderer.light.skylight import coefficients as sky_coefficients
 from renderer.mitsuba_scene import mitsuba_map
 
 CLASSES = ("orange", "lime", "sky", "night")
+
+
+def test_the_lines_of_an_attack_on_the_sky_tell_its_sun(attacked, tmp_path):
+    result = attacked("skylight", {}, target="lime", max_steps=3, margin=100.0)
+    augment.save(result, tmp_path)
+    (line, *_) = [json.loads(line) for line in (tmp_path / LINES).read_text().splitlines()]
+    # The scene multiplies the sky by a factor.
+    sky = sky_coefficients(**line["sky"]).numpy()
+    shown = json.loads((tmp_path / "example_000" / "light.json").read_text())["coefficients"]
+    scale = np.linalg.norm(shown) / np.linalg.norm(sky)
+    assert np.abs(scale * sky - shown).max() < 1e-6
 
 
 @pytest.mark.parametrize("margin", [0.5, 100.0])
