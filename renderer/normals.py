@@ -317,7 +317,7 @@ def _groups_of_file(
         vertex * count + np.roll(faces, -1, axis=1).ravel(), return_counts=True
     )
     is_mixed = np.isin(np.arange(count), np.divmod(edges[counts > 1], count))
-    agree &= ~is_mixed[vertex[first]] | (side[first] * side[second] >= 0)
+    agree &= ~is_mixed[vertex[first]] | (side[first] * side[second] > 0)
     return _joined(faces, first[agree], second[agree]), is_given
 
 

@@ -311,9 +311,12 @@ class SignalHandler:
         return self
 
     def __exit__(self, error: type[BaseException] | None, *rest: object) -> None:
-        """Restore the handlers, and let a noted signal take effect unless an error is raised."""
+        """Restore the handlers, and let a noted signal take effect.
+
+        It may be the reason of an error, such as that of a worker that it ended.
+        """
         self._restore()
-        if error is None and self._number is not None:
+        if self._number is not None and (error is None or issubclass(error, Exception)):
             signal.raise_signal(self._number)
 
     def requested(self) -> bool:

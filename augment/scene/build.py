@@ -492,7 +492,8 @@ def expose(scene: Scene) -> Scene:
             mean = encode(clamp(values * 2**middle + local), scene.settings.encoding).mean()
             low, high = (middle, high) if mean < aim else (low, middle)
         # Nothing brightens what is black, and nothing darkens projector and lamps.
-        is_above = lit > 0 and low == -STOPS
+        local_mean = encode(clamp(local), scene.settings.encoding).mean()
+        is_above = lit > 0 and float(local_mean) >= aim
         factors.append(2**low if lit and not is_above else 1.0)
         if rows:
             mean = encode(clamp(values * factors[-1] + local), scene.settings.encoding).mean()

@@ -242,34 +242,37 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
         raise ValueError(f"no .mtl file defines the material {name}")
     folder, is_linear, properties = definition
     material = _Material()
+    color_key, texture_key = "kd", "map_kd"
     texts = {keyword.lower(): text for keyword, text in properties}
     emitted = {key for key in ("ke", "map_ke") if texts.get(key, "").strip("0. ")}
     if emitted and "map_kd" not in texts and not texts.get("kd", "1").strip("0. "):
         file.assume("the light that a black material emits is taken as its color")
-        properties = [
-            (key.lower().replace("ke", "kd") if key.lower() in emitted else key, text)
-            for key, text in properties
-            if key.lower() != "kd"
-        ]
+        color_key, texture_key = "ke", "map_ke"
+        unused = {"kd", "ke", "map_ke"} - emitted
+        properties = [item for item in properties if item[0].lower() not in unused]
     # Opacity ("d") or transparency ("tr"), of which "d" counts if a material has both.
     opacities = {}
     for keyword, text in properties:
         match keyword.lower():
-            case "kd":
+            case key if key == color_key:
                 values: list[float] = []
                 # Words such as "spectral" are no numbers.
                 with suppress(ValueError):
                     words = mesh_file.without_comments(text.encode()).split()
                     values = [float(word) for word in words]
+                if key == "ke":  # The strength of light has no limit.
+                    values = [value / max(1.0, *values) for value in values]
                 is_color = all(0 <= value <= 1 + mesh_file.TOLERANCE for value in values)
                 if len(values) not in (1, 3) or not is_color:
-                    raise ValueError(f'"Kd {text}" is no color: give red, green, blue from 0 to 1')
+                    raise ValueError(
+                        f'"{keyword} {text}" is no color: give red, green, blue from 0 to 1'
+                    )
                 color = tuple(min(value, 1.0) for value in values * (3 // len(values)))
                 material = material._replace(color=color)
-            case "map_kd":
+            case key if key == texture_key:
                 texture = _NEUTRAL_OPTIONS.sub("", text, count=1)
                 if not texture or texture.startswith("-"):
-                    fault = f'"map_Kd {text}" is not an image alone'
+                    fault = f'"{keyword} {text}" is not an image alone'
                     raise ValueError(f"{fault}: leave its options out")
                 material = material._replace(texture=(texture, folder))
             case "d" | "tr" as key:

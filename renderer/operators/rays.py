@@ -457,8 +457,8 @@ class LocalLightView:
     The light and the albedo may change between the renders. All computations run
     on the CPU, because rays are cast there. For lights that stay in place, rays
     are cast once. For lamps that move, rays are cast in every render. Derivatives
-    hold fixed which lamps, and which pixels of a projected pattern, light a
-    sample.
+    hold fixed which lamps light a sample, and without silhouettes also which pixels
+    of a projected pattern do.
 
     Attributes:
         rays: Rays among the faces of the mesh.
@@ -496,12 +496,15 @@ class LocalLightView:
         if moved is None:
             self.fixed_paths[basis] = paths
         shown = (fragments or surface.fragments).to("cpu")
-        if surface.gloss is not None and shown.cameras is not surface.fragments.cameras:
-            # With silhouettes, highlights have gradients with respect to the camera.
+        # With silhouettes, gradients include how surfaces move past the camera and the projector.
+        is_moving = shown.cameras is not surface.fragments.cameras
+        if surface.gloss is not None and is_moving:
             seen = replace(surface.fragments, cameras=shown.cameras)
             surface = replace(surface, fragments=seen)
+        arriving = light.cpu().double()[paths.function]
+        if is_moving:
+            arriving = basis.arriving(light.cpu().double(), paths, surface.points)
         # Irradiance at the end of each path: one row for each path, one column for each color.
-        arriving = basis.arriving(light.cpu().double(), paths, surface.points)
         irradiance = paths.irradiance[:, None] * arriving
         radiance = path_reflectance(surface, albedo.cpu().double(), paths) / shown.samples**2
         radiance = radiance * irradiance

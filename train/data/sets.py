@@ -5,6 +5,7 @@ that training shows it.
 """
 
 import hashlib
+import os
 import signal
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -41,6 +42,8 @@ MIN_CROP_AREA = 0.35
 # A large JPEG file is decoded at a fraction of its size, which is fast. The decoded
 # image has at least twice the size of the image that is shown.
 DECODED_SCALE = 2
+# Seconds in which worker processes read on after SIGTERM.
+GRACE = 5
 
 # Index of an image in `ImageFiles.paths`, and seed of its random crop. If the seed
 # is None, the central square of the image is read instead of a crop.
@@ -140,7 +143,7 @@ class ImageFiles:
         errors: ReadErrors = {}
         options: dict[str, Any] = {"num_workers": self.workers, "collate_fn": _collate}
         # Otherwise, each loader draws from the global generator, also when a run is resumed.
-        options |= {"generator": torch.Generator(), "worker_init_fn": _leave_signal}
+        options |= {"generator": torch.Generator(), "worker_init_fn": _outlive_signal}
         loader: DataLoader = DataLoader(_Reader(self), batch_sampler=list(batches), **options)
         for images, errors_in_batch in loader:
             errors |= errors_in_batch
@@ -154,9 +157,15 @@ class ImageFiles:
             console.warning("%d images cannot be read, others were shown: %s", len(errors), first)
 
 
-def _leave_signal(worker: int) -> None:
-    """Leave SIGTERM to the main process, also if a job sends it to all processes."""
-    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+def _outlive_signal(worker: int) -> None:
+    """Read on for GRACE seconds after SIGTERM, which a job sends to all its processes at once.
+
+    The main process ends its step in this time. Workers may not ignore the signal, because a
+    process that ends sends it to them, and waits for them.
+    """
+    signal.signal(signal.SIGTERM, lambda *_: signal.alarm(GRACE))
+    # PyTorch raises an error if a worker is killed.
+    signal.signal(signal.SIGALRM, lambda *_: os._exit(0))
 
 
 class _Reader(Dataset[tuple[Tensor, ReadErrors]]):

@@ -131,8 +131,7 @@ class LitView:
     def changed_surface(self, vertices: Tensor, albedo: Tensor) -> Tensor:
         surface = Surface(self.mesh, self.view, self.settings, vertices)
         lit = LocalLightView(Rays(self.mesh), surface)
-        # Pixels of a projector are equal, because differences of single samples see no edges.
-        return lit.radiance(self.basis, albedo, draw_uniform(1, 3).expand(self.basis.size, 3))
+        return lit.radiance(self.basis, albedo, draw_uniform(self.basis.size, 3))
 
 
 @lamps_and_discs
