@@ -521,7 +521,8 @@ def normalization_of(network: Any, limits: tuple[float, float] = (0.0, 1.0)) -> 
         for name in MEANS:
             names = name, name.replace("mean", "std")
             mean, std = (_channels(module, found) for found in names)
-            if mean:
+            # A mean alone may be that of three features.
+            if mean and (std or name != "mean"):
                 std = std or [1.0] * 3
                 # The network normalizes values in [0, 1]. Convert to the units of the limits.
                 mean = [black + (white - black) * value for value in mean]
@@ -541,13 +542,13 @@ def _channels(module: nn.Module, name: str) -> list[float]:
     in modules that are named after it.
     """
     own = getattr(module, "original_name", type(module).__name__)  # A script has another class.
-    is_named = any(part in own for part in NORMALIZING)
+    is_named = any(part in str(own) for part in NORMALIZING)
     # `kornia.augmentation.Normalize` keeps them in a dictionary.
     flags = getattr(module, "flags", None)
     value = flags.get(name) if isinstance(flags, dict) else getattr(module, name, None)
     # A network of OpenMMLab does not call the preprocessor that it contains.
     is_called = "BaseDataPreprocessor" not in [kind.__name__ for kind in type(module).__mro__]
-    kinds = Tensor | list | tuple | float if is_named else Tensor
+    kinds = Tensor | np.ndarray | list | tuple | float | int if is_named else Tensor
     if not (is_called and isinstance(value, kinds)):
         return []
     numbers = torch.as_tensor(value).flatten().tolist()
