@@ -585,7 +585,7 @@ def mean_and_std(normalization: Normalization) -> tuple[Sequence[float], Sequenc
     """
     if normalization is None:
         return (0.0,) * 3, (1.0,) * 3
-    if normalization == IMAGENET:
+    if isinstance(normalization, str) and normalization == IMAGENET:
         return IMAGENET_MEAN, IMAGENET_STD
     expected = "'imagenet', or (mean, std) of three numbers each"
     rows = errors.as_list("normalization", normalization, tuple | list, expected)

@@ -149,7 +149,7 @@ def compare_calls(
 
 def load_on(device: str) -> MixedPrecision:
     """Load the network that is attacked, in the precision that suits the device."""
-    network = load_run(NETWORK).to(device)
+    network = load_run(NETWORK).to(device).to(memory_format=torch.channels_last)
     return MixedPrecision(network, choose_precision("auto", torch.device(device)))
 
 

@@ -403,14 +403,13 @@ def center_and_extent(mesh: Mesh) -> tuple[np.ndarray, float]:
     """Compute the center of a mesh, and its largest extent from the center along an axis.
 
     `normalize` moves the center to the origin and scales the extent to 1. The center is the mean
-    of the face centers, weighted with the areas. Faces without area, such as those of objects that
-    a scale of 0 hides, do not count.
+    of the face centers, weighted with the areas.
     """
     areas = mesh.face_areas()
     if not areas.sum() > 0:
         raise InputError("the surface of the mesh has the area 0: give faces with an area")
-    corners = mesh.vertices.take(mesh.faces[areas > 0], axis=0)
-    center = np.average(corners.mean(axis=1), axis=0, weights=areas[areas > 0])
+    corners = mesh.vertices.take(mesh.faces, axis=0)
+    center = np.average(corners.mean(axis=1), axis=0, weights=areas)
     return center, np.abs(corners - center).max()
 
 

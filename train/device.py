@@ -132,12 +132,11 @@ def choose_precision(precision: str, device: torch.device, trained: nn.Module | 
 class MixedPrecision(Network):
     """Network that computes in a chosen precision.
 
-    Images and logits are float32. Between them, torch.autocast uses the chosen precision. The
-    weights of the network are changed to channels-last.
+    Images and logits are float32. Between them, torch.autocast uses the chosen precision.
     """
 
     def __init__(self, network: nn.Module, precision: str):
-        super().__init__(network.to(memory_format=torch.channels_last))
+        super().__init__(network)
         self.precision = precision
 
     def forward(self, images: Tensor, *targets: Any) -> Any:
@@ -159,7 +158,7 @@ def place(
     set_deterministic(settings.deterministic)
     device = choose_device(settings.device)
     precision = choose_precision(settings.precision, device, network)
-    model = MixedPrecision(network.to(device), precision)
+    model = MixedPrecision(network.to(device).to(memory_format=torch.channels_last), precision)
     torch.set_num_threads(threads or choose_threads(model, settings.batch_size, size))
     return model
 

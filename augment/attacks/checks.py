@@ -34,6 +34,7 @@ GROWTH = (3, 10)
 Successes = Bool[Tensor, "2 N"]
 
 
+@torch.inference_mode(False)  # Attacks need autograd.
 def check(result: AttackResult) -> dict[str, Any]:
     """Compare an attack with random draws and with longer attacks.
 
@@ -103,6 +104,7 @@ def check(result: AttackResult) -> dict[str, Any]:
     }
 
 
+@torch.inference_mode(False)
 def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dict[str, Any]]:
     """Measure how the success of an attack depends on the radius of the norm-balls.
 
@@ -160,6 +162,7 @@ def success_by_radius(result: AttackResult, scales: Sequence[float]) -> list[dic
     return rows
 
 
+@torch.inference_mode(False)
 def transfer(
     result: AttackResult,
     classifiers: Sequence[Classifier | Callable[[Tensor], Tensor]] = (),

@@ -241,7 +241,9 @@ def draw_photograph_patterns(
     # `grid_sample` needs x and y on the last axis.
     height, width = photographs.shape[-2:]
     grid = rotated.permute(1, 2, 3, 0) * rotated.new_tensor([1, width / height])
-    shown = F.grid_sample(photographs, grid, padding_mode="reflection", align_corners=False)
+    shown = F.grid_sample(
+        photographs, grid.to(photographs), padding_mode="reflection", align_corners=False
+    )
     # Change the saturation: scale the difference between each color and its gray value.
     gray = luminance(shown)
     factor = MAX_SATURATION * relative_saturation[:, None]

@@ -69,6 +69,8 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
     needed = 0
     for index in nodes:
         node = file.tree["nodes"][index]
+        if not file.poses[index][:3, :3].any():  # A scale of 0 hides an object.
+            continue
         if "skin" in node:
             raise ValueError("joints move its vertices: apply the armature, and export it")
         mesh = file.entry("meshes", node["mesh"])

@@ -186,7 +186,9 @@ def export_mesh(
     """
     require_mesh("mesh", mesh)
     path = errors.as_path("path", path)
-    cameras = errors.as_list("cameras", cameras, Camera, "a list of cameras")
+    given = errors.as_list("cameras", cameras, Camera, "a list of cameras")
+    cameras = [camera.fixed() for camera in given]
+    errors.require_number("aspect", aspect, 1e-3, 1e3)
     first = len(mesh.faces) if first is None else first
     errors.require_whole("first", first, 0, len(mesh.faces))
     unit_normals = mesh.written_normals(normals)

@@ -28,7 +28,7 @@ from torch import Tensor
 
 from renderer.errors import InputError, as_tensor, require_finite
 from renderer.light.basis import HARMONICS
-from renderer.modes import once_differentiable
+from renderer.modes import once_differentiable, without_autocast
 from renderer.settings import TURBIDITY
 
 # Smallest and largest zenith angle of the sun in degrees: from overhead to the horizon.
@@ -45,6 +45,7 @@ _OPPOSITE_ORDER = torch.tensor([l * l + l - m for l, m in _BANDS_AND_ORDERS])
 _ROW_IN_FIT = torch.tensor([l * (l + 1) // 2 + abs(m) for l, m in _BANDS_AND_ORDERS])
 
 
+@without_autocast
 def coefficients(
     zenith: Tensor | float,
     azimuth: Tensor | float,

@@ -267,7 +267,9 @@ def test_what_the_user_leaves_out_is_said_once_to_be_assumed(tmp_path, said, war
 
 def test_normalization_is_said_in_the_units_of_the_user_and_as_a_network_states_it(said):
     plain = nn.Sequential(nn.AdaptiveAvgPool2d(1), nn.Flatten()).eval()
-    as_network(plain, value_range=(-1, 1), normalization=((0, 0.1, 0), (1, 2, 1)))
+    given = np.array([0, 0.1, 0]).tolist(), [*np.array([1.0, 2, 1])]
+    network = as_network(plain, value_range=(-1, 1), normalization=given)
+    assert network(torch.rand(1, 3, 224, 224)).dtype == torch.float32
     as_network(nn.Sequential(Normalize(MEAN, STD), plain).eval(), 8)
     first, second = said()
     assert "std (1, 2, 1), stated by you; values from -1 to 1, stated by you" in first

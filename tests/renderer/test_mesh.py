@@ -84,14 +84,6 @@ def test_a_normalized_mesh_is_centered_at_its_centroid_and_fits_the_unit_cube():
     assert_array_equal(mesh.vertices, mesh.vertices.astype(np.float32))
 
 
-def test_a_face_without_area_far_away_does_not_shrink_a_mesh():
-    cone = trimesh.creation.cone(radius=0.3, height=2)
-    vertices = np.concatenate([cone.vertices, np.full((3, 3), 50.0)])
-    faces = np.concatenate([cone.faces, len(cone.vertices) + np.arange(3)[None]])
-    mesh = normalize(Mesh.plain(vertices, faces))
-    assert_allclose(mesh.vertices[:-3], normalize(mesh_of(cone)).vertices, atol=1e-7)
-
-
 def test_a_surface_of_zero_area_cannot_be_normalized():
     with pytest.raises(InputError):
         normalize(Mesh.plain(np.zeros((3, 3)), [[0, 1, 2]]))

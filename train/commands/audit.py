@@ -89,6 +89,7 @@ def run(settings: AuditSettings) -> None:
     print(f"{result.screen}\nreport: {result.path}")
 
 
+@torch.inference_mode(False)  # Attacks need autograd.
 def audit(
     network: TaskNetwork | Callable[[Tensor], Any],
     meshes: Sequence[class_names.MeshItem],

@@ -67,6 +67,7 @@ def run(settings: EvaluateSettings) -> None:
     print(f"{text}\ntable, scores and image: {Path(settings.out)}")
 
 
+@torch.inference_mode(False)  # Weights of the caller would become inference tensors.
 def evaluate(
     network: TaskNetwork | Callable[[torch.Tensor], Any],
     photos: str | Path,

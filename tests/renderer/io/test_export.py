@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 import trimesh
 from gltf_files import read_tree
 from numpy.testing import assert_allclose, assert_array_equal
@@ -134,7 +135,7 @@ def test_the_cameras_of_a_glb_project_as_ours(tmp_path):
         *orbit_cameras(2, 3.0, 57.3, 22.9),
         OrthographicCamera(**view),
         PerspectiveCamera(**view, distance=1.2),
-        PerspectiveCamera(**view, distance=3.0),
+        PerspectiveCamera(**view | {"polar": torch.tensor(114.6).double()}, distance=3.0),
         PinholeCamera(**view, distance=3.0, roll=20.0, center_z=0.1, pixel_aspect=1.2),
     ]
     export_mesh(box(), tmp_path / "mesh.glb", cameras=cameras)

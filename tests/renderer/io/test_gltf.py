@@ -152,6 +152,14 @@ def test_textures_are_wrapped_as_opengl_wraps_them(tmp_path, wrap_u, wrap_v, glo
     assert_allclose(albedo_at(mesh, uvs), expected, atol=1e-5)
 
 
+def test_a_node_of_scale_0_is_hidden(tmp_path):
+    gltf = plain()
+    gltf.tree["nodes"].append({"mesh": 0, "scale": [0, 0, 0], "translation": [9, 9, 9]})
+    gltf.tree["scenes"] = [{"nodes": [0, 1]}]
+    shown = plain().load(tmp_path)
+    assert_array_equal(gltf.load(tmp_path).vertices, shown.vertices)
+
+
 @pytest.mark.parametrize("wrap", [33071, 33648])
 def test_parts_with_one_texture_share_its_extended_copy(tmp_path, wrap):
     gltf = Gltf()

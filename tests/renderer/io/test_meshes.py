@@ -69,6 +69,16 @@ def has_texture(mesh: Mesh) -> bool:
     return len(mesh.textures) == 1 and np.array_equal(mesh.textures[0], TEXTURE)
 
 
+def test_facets_of_zeros_at_the_end_of_an_stl_are_left_out(tmp_path):
+    """As numpy-stl writes rows that were not filled."""
+    ball = trimesh.creation.icosphere(1, radius=0.1).apply_translation([5, 5, 5])
+    content = bytearray(ball.export(file_type="stl"))
+    content[80:84] = (len(ball.faces) + 3).to_bytes(4, "little")
+    write(tmp_path / "ball.stl", bytes(content) + bytes(3 * 50))
+    mesh = load_mesh(tmp_path / "ball.stl")
+    assert len(mesh.faces) == len(ball.faces) and mesh.vertices.min() > 4
+
+
 def test_an_stl_is_white_and_its_corners_are_joined(tmp_path):
     """The format repeats a vertex in each of its faces."""
     box = trimesh.creation.box()

@@ -94,3 +94,9 @@ def test_the_azimuth_rotates_the_light_counterclockwise(azimuth):
     expected = rotate(coefficients(0.8, 0.0, 3.0), torch.from_numpy(matrix))
     found = coefficients(0.8, azimuth, 3.0)
     torch.testing.assert_close(found, expected, rtol=0, atol=100 * 60 * EPS)
+
+
+def test_autocast_changes_no_bit_of_a_sky():
+    expected = skylight.coefficients(50.0, 20.0, 3.0)
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        assert torch.equal(skylight.coefficients(50.0, 20.0, 3.0), expected)

@@ -2,6 +2,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from torch import nn
 
 import norm_balls as nb
 from tests.helpers import Brightness, save_plain
@@ -34,6 +35,15 @@ def test_scores_count_the_photographs_of_each_class(photographs):
     assert scores.groups["dark"].class_top1.value == pytest.approx(3 / 4)
     assert scores.groups["bright"].class_top1.value == pytest.approx(2 / 3)
     assert scores.overall.class_top5.value == 1
+
+
+def test_weights_of_the_caller_keep_their_layout_and_their_gradients(photographs):
+    """Also in inference mode, as in a validation."""
+    network = nn.Sequential(nn.Conv2d(3, 2, 3), nn.AdaptiveAvgPool2d(1), nn.Flatten()).eval()
+    with torch.inference_mode():
+        nb.evaluate(network, photographs, **OPTIONS)
+    weight = network[0].weight
+    assert weight.is_contiguous() and not weight.is_inference() and weight.requires_grad
 
 
 def test_a_label_may_be_an_index(photographs):
