@@ -553,7 +553,10 @@ def _preprocessed(
     module = network if isinstance(network, nn.Module) else wrappers.Function(network)
     mean, std = mean_and_std(normalization)
     limits = "the values of black and white"
-    black, white = errors.as_list("value_range", value_range, float | int, limits)
+    ends = errors.as_list("value_range", value_range, float | int, limits)
+    if len(ends) != 2:
+        raise InputError(f"value_range has {len(ends)} numbers: give {limits}")
+    black, white = map(float, ends)
     if not black < white:
         raise InputError(f"value_range is ({black}, {white}): give black before white")
     if normalization is None and (black, white) == UNIT_RANGE:

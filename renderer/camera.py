@@ -64,7 +64,8 @@ class Camera(ABC):
         up: Distance by which the origin appears above the image center, in world
             units.
         clip_range: Largest difference between the depth of a visible surface and
-            the depth of the origin, in world units.
+            the depth of the origin, in world units. The default is extended to
+            show the whole mesh.
         distance: Distance of the camera from the origin in world units.
 
     Raises:

@@ -193,7 +193,9 @@ def fit_scene(
     photograph = photograph.double()
     mask = mask.double()
     target = _Target.from_photograph(photograph, mask, mesh, size, options)
-    starts = [start] if start else []
+    if start is not None and fov is not None:
+        raise InputError(f"fov={fov} does not change the camera start: leave one of them out")
+    starts = [start.fixed()] if start else []
     if start is None:
         # A search in a small copy of the photograph is faster.
         coarse_size = min(COARSE_SIZE, size)
@@ -413,7 +415,7 @@ class _Target(NamedTuple):
         union = torch.maximum(coverage, self.mask).sum()
         # Fraction of the union of the render and the mask that both cover.
         overlap = torch.minimum(coverage, self.mask).sum() / union
-        return FittedScene(camera, light, error, float(overlap))
+        return FittedScene(camera, light.float(), error, float(overlap))
 
 
 def _fit_channels(

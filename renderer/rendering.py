@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from renderer import errors
-from renderer.camera import Camera, OrthographicCamera
+from renderer.camera import CLIP_RANGE, Camera, OrthographicCamera
 from renderer.errors import InputError
 from renderer.image import as_background, composite, encode
 from renderer.light.basis import HARMONICS, Basis, LitBasis, LocalBasis, SplitLight, split_light
@@ -326,7 +326,8 @@ def precompute_transfer(
         (torch.Size([2, 3, 16, 16]), torch.Size([2, 2, 3, 16, 16]))
     """
     settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
-    all_cameras = _checked_cameras(mesh, cameras, albedo_scale, gloss)
+    checked = _checked_cameras(mesh, cameras, albedo_scale, gloss)
+    all_cameras = [camera.fixed() for camera in checked]
     shown = mesh, all_cameras, settings, _choose(rasterizer), albedo_scale
     operators = build_operators(*shown, gloss=gloss, device=errors.as_device(device))
     return operators[0] if isinstance(cameras, Camera) else TransferOperators(operators)
@@ -378,13 +379,19 @@ def _checked_cameras(
     errors.require_number("albedo_scale", albedo_scale, 0, errors.MAX_SCALE)
     expected = "nb.Gloss(roughness, metallic, specular_factor) or None"
     errors.require_kind("gloss", gloss, Gloss | None, expected)
-    if isinstance(cameras, Camera):
-        return [cameras]
     expected = "a camera or a list of cameras, such as nb.orbit_cameras(10, width=2.0)"
-    all_cameras = errors.as_list("cameras", cameras, Camera, expected)
+    given = [cameras] if isinstance(cameras, Camera) else cameras
+    all_cameras = errors.as_list("cameras", given, Camera, expected)
     if not all_cameras:
         raise InputError(f"cameras is empty: give {expected}")
-    return all_cameras
+    # A camera with the default range has not been told how far the mesh reaches.
+    radius = math.sqrt(3) * float(np.abs(mesh.vertices).max(initial=0))
+    if radius > CLIP_RANGE:
+        radius = float(np.linalg.norm(mesh.vertices[mesh.faces], axis=-1).max(initial=0))
+    return [
+        camera.with_clip_range(radius) if camera.clip_range == CLIP_RANGE else camera
+        for camera in all_cameras
+    ]
 
 
 def _as_light(light: object) -> Tensor:

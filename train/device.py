@@ -310,12 +310,9 @@ class SignalHandler:
         return self
 
     def __exit__(self, error: type[BaseException] | None, *rest: object) -> None:
-        """Restore the handlers, and let a noted signal take effect.
-
-        It may be the reason of an error, such as that of a worker that it ended.
-        """
+        """Restore the handlers, and let a noted signal take effect unless an error is raised."""
         self._restore()
-        if self._number is not None and (error is None or issubclass(error, Exception)):
+        if error is None and self._number is not None:
             signal.raise_signal(self._number)
 
     def requested(self) -> bool:

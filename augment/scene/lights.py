@@ -358,6 +358,7 @@ class CastShadow(LightModel):
     def __post_init__(self) -> None:
         for kind in as_list("kinds", self.kinds, str, "a list of names"):
             require_choice("kinds", kind, SHADOWS)
+        object.__setattr__(self, "kinds", tuple(self.kinds))
         if not self.kinds:
             raise InputError("kinds is empty: name at least one kind of shadow")
 

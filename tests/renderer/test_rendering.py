@@ -237,6 +237,19 @@ def test_a_leaf_with_two_sides_has_the_image_of_a_leaf_with_one(light, shadows, 
     torch.testing.assert_close(operators.image(light.float()), found.float(), rtol=0, atol=1e-5)
 
 
+def test_a_mesh_of_any_size_is_shown_whole(light):
+    """As its normalized copy. A range that the user gives cuts it."""
+    ball = renderer.solid("ball")
+    large = replace(ball, vertices=4 * ball.vertices)
+    expected = renderer.render(ball, renderer.orbit_cameras(2, 2.4), light, 16)
+    cameras = renderer.orbit_cameras(2, 9.6)
+    torch.testing.assert_close(renderer.render(large, cameras, light, 16), expected)
+    [operator, _] = renderer.precompute_transfer(large, cameras, 16)
+    torch.testing.assert_close(operator.image(light), expected[0].to(light), rtol=0, atol=1e-5)
+    cut = [replace(camera, clip_range=3.0) for camera in cameras]
+    assert not torch.allclose(renderer.render(large, cut, light, 16), expected, atol=0.1)
+
+
 @pytest.mark.parametrize(
     ("kind", "name", "bounces", "encoding"),
     [("a color per face", "plate", 0, "linear"), ("a texture", "cup", 2, "srgb")],
