@@ -555,7 +555,7 @@ def _preprocessed(
     limits = "the values of black and white"
     ends = errors.as_list("value_range", value_range, float | int, limits)
     if len(ends) != 2:
-        raise InputError(f"value_range has {len(ends)} numbers: give {limits}")
+        raise InputError(f"value_range has the length {len(ends)}: give {limits}")
     black, white = map(float, ends)
     if not black < white:
         raise InputError(f"value_range is ({black}, {white}): give black before white")

@@ -551,6 +551,10 @@ def _channels(module: nn.Module, name: str) -> list[float]:
     kinds = Tensor | np.ndarray | list | tuple | float | int if is_named else Tensor
     if not (is_called and isinstance(value, kinds)):
         return []
-    numbers = torch.as_tensor(value).flatten().tolist()
+    try:
+        given = value if isinstance(value, Tensor) else np.array(value, dtype=float)
+    except (TypeError, ValueError):  # Words, such as the names of the channels.
+        return []
+    numbers = given.flatten().tolist()
     numbers *= 3 if is_named and len(numbers) == 1 else 1
     return numbers if len(numbers) == 3 else []

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Self, TypeVar
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from renderer import errors
@@ -416,6 +416,20 @@ class PerspectiveCamera(Camera):
         """Return the smallest allowed depth, and the depths of the near and of the far plane."""
         field = partial(_column, cameras, depths)
         return MIN_NEAR_RATIO * field("distance"), field("near"), field("far")
+
+
+def showing(
+    cameras: Sequence[Camera], vertices: Float[np.ndarray, "V 3"], faces: Int[np.ndarray, "F 3"]
+) -> list[Camera]:
+    """Extend the clipping range of cameras that have the default, so that they show all faces."""
+    # A bound of the distance from the origin, which is enough for normalized meshes.
+    radius = math.sqrt(3) * float(np.abs(vertices).max(initial=0))
+    if radius > CLIP_RANGE:
+        radius = float(np.linalg.norm(vertices[faces], axis=-1).max(initial=0))
+    return [
+        camera.with_clip_range(radius) if camera.clip_range == CLIP_RANGE else camera
+        for camera in cameras
+    ]
 
 
 def project_views(cameras: Sequence[Camera], points: Points) -> Points:

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from renderer import errors
-from renderer.camera import CLIP_RANGE, Camera, OrthographicCamera
+from renderer.camera import Camera, OrthographicCamera, showing
 from renderer.errors import InputError
 from renderer.image import as_background, composite, encode
 from renderer.light.basis import HARMONICS, Basis, LitBasis, LocalBasis, SplitLight, split_light
@@ -176,6 +176,7 @@ def render(
     # Rasterizing and ray tracing have no gradients, so they take a mesh and cameras with plain
     # numbers instead of tensors.
     moved_mesh = replace(mesh, vertices=vertices.detach().cpu().double().numpy())
+    all_cameras = showing(all_cameras, moved_mesh.vertices, mesh.faces)
     backgrounds = as_background(background, size, like)
     view_count = len(all_cameras)
     if backgrounds.ndim > 3 and len(backgrounds) not in (1, view_count):
@@ -327,7 +328,8 @@ def precompute_transfer(
     """
     settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
     checked = _checked_cameras(mesh, cameras, albedo_scale, gloss)
-    all_cameras = [camera.fixed() for camera in checked]
+    fixed = [camera.fixed() for camera in checked]
+    all_cameras = showing(fixed, mesh.vertices, mesh.faces)
     shown = mesh, all_cameras, settings, _choose(rasterizer), albedo_scale
     operators = build_operators(*shown, gloss=gloss, device=errors.as_device(device))
     return operators[0] if isinstance(cameras, Camera) else TransferOperators(operators)
@@ -384,14 +386,7 @@ def _checked_cameras(
     all_cameras = errors.as_list("cameras", given, Camera, expected)
     if not all_cameras:
         raise InputError(f"cameras is empty: give {expected}")
-    # A camera with the default range has not been told how far the mesh reaches.
-    radius = math.sqrt(3) * float(np.abs(mesh.vertices).max(initial=0))
-    if radius > CLIP_RANGE:
-        radius = float(np.linalg.norm(mesh.vertices[mesh.faces], axis=-1).max(initial=0))
-    return [
-        camera.with_clip_range(radius) if camera.clip_range == CLIP_RANGE else camera
-        for camera in all_cameras
-    ]
+    return all_cameras
 
 
 def _as_light(light: object) -> Tensor:

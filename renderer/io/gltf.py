@@ -69,10 +69,10 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
     needed = 0
     for index in nodes:
         node = file.tree["nodes"][index]
-        if not file.poses[index][:3, :3].any():  # A scale of 0 hides an object.
-            continue
         if "skin" in node:
             raise ValueError("joints move its vertices: apply the armature, and export it")
+        if not file.poses[index][:3, :3].any():  # A scale of 0 hides an object.
+            continue
         mesh = file.entry("meshes", node["mesh"])
         # Weights of the morph targets. Those of the node replace those of the mesh.
         weights = tuple(node.get("weights", mesh.get("weights", ())))

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from renderer import errors
-from renderer.camera import Camera, PerspectiveCamera
+from renderer.camera import Camera, PerspectiveCamera, showing
 from renderer.errors import InputError
 from renderer.image import decode
 from renderer.io.files import atomic_write
@@ -187,7 +187,7 @@ def export_mesh(
     require_mesh("mesh", mesh)
     path = errors.as_path("path", path)
     given = errors.as_list("cameras", cameras, Camera, "a list of cameras")
-    cameras = [camera.fixed() for camera in given]
+    cameras = showing([camera.fixed() for camera in given], mesh.vertices, mesh.faces)
     errors.require_number("aspect", aspect, 1e-3, 1e3)
     first = len(mesh.faces) if first is None else first
     errors.require_whole("first", first, 0, len(mesh.faces))

@@ -243,8 +243,10 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
     folder, is_linear, properties = definition
     material = _Material()
     color_key, texture_key = "kd", "map_kd"
-    texts = {keyword.lower(): text for keyword, text in properties}
+    texts = {keyword.lower(): text.partition("#")[0] for keyword, text in properties}
     emitted = {key for key in ("ke", "map_ke") if texts.get(key, "").strip("0. ")}
+    if not re.fullmatch(r"(\s*[\d.]+(e[+-]?\d+)?){3}\s*", texts.get("ke", ""), re.IGNORECASE):
+        emitted.discard("ke")
     if emitted and "map_kd" not in texts and not texts.get("kd", "1").strip("0. "):
         file.assume("the light that a black material emits is taken as its color")
         color_key, texture_key = "ke", "map_ke"

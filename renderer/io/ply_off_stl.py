@@ -322,10 +322,12 @@ def read_stl(file: MeshFile) -> list[Part]:
         raise ValueError("colors in .stl files are not supported: export the mesh as .ply")
     if not face_count:
         return []
+    mesh_file.require_bounded(coordinates=coordinates)
     corners = coordinates.reshape(-1, 3, 3)
     # Arrays that a program has not filled end with facets of zeros.
     vertices = corners[(corners != corners[:, :1]).any((1, 2))].reshape(-1, 3)
-    mesh_file.require_bounded(coordinates=vertices)
+    if not len(vertices):
+        return []
     # Files have no shared vertices: each face has three of its own.
     vertex_ids = np.arange(len(vertices)).reshape(-1, 3)
     return [Part(mesh_file.colored_mesh(vertices, vertex_ids, np.ones((1, 3))))]

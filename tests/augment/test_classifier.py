@@ -182,7 +182,7 @@ def with_pixel_mean(network: nn.Module) -> nn.Module:
         (lambda _: small_detector(3, SIZE), {"normalization": "imagenet"}, "normalization out"),
         (lambda network: network, {"classes": CLASSES[:2]}, "classes has 2 names"),
         (lambda network: network, {"normalization": BYTES}, "value_range"),
-        (lambda network: network, {"value_range": (0, 1, 2)}, "3 numbers"),
+        (lambda network: network, {"value_range": (0, 1, 2)}, "length 3"),
         (lambda _: nn.Flatten, {}, "Flatten"),
         (partial(Classifier, size=SIZE, classes=CLASSES), {"classes": CLASSES}, "plain network"),
     ],

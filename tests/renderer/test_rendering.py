@@ -244,6 +244,8 @@ def test_a_mesh_of_any_size_is_shown_whole(light):
     expected = renderer.render(ball, renderer.orbit_cameras(2, 2.4), light, 16)
     cameras = renderer.orbit_cameras(2, 9.6)
     torch.testing.assert_close(renderer.render(large, cameras, light, 16), expected)
+    moved = {"vertices": torch.from_numpy(large.vertices)}
+    torch.testing.assert_close(renderer.render(ball, cameras, light, 16, **moved), expected)
     [operator, _] = renderer.precompute_transfer(large, cameras, 16)
     torch.testing.assert_close(operator.image(light), expected[0].to(light), rtol=0, atol=1e-5)
     cut = [replace(camera, clip_range=3.0) for camera in cameras]

@@ -7,6 +7,7 @@ that training shows it.
 import hashlib
 import os
 import signal
+import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -163,9 +164,13 @@ def _outlive_signal(worker: int) -> None:
     The main process ends its step in this time. Workers may not ignore the signal, because a
     process that ends sends it to them, and waits for them.
     """
-    signal.signal(signal.SIGTERM, lambda *_: signal.alarm(GRACE))
-    # PyTorch raises an error if a worker is killed.
-    signal.signal(signal.SIGALRM, lambda *_: os._exit(0))
+
+    def exit_later(*_: object) -> None:
+        timer = threading.Timer(GRACE, os._exit, (0,))
+        timer.daemon = True
+        timer.start()
+
+    signal.signal(signal.SIGTERM, exit_later)
 
 
 class _Reader(Dataset[tuple[Tensor, ReadErrors]]):

@@ -193,7 +193,12 @@ def test_faces_of_a_material_without_a_name_are_white(tmp_path):
 @pytest.mark.filterwarnings("ignore:ignored in .obj files", "ignore:.*black material emits")
 @pytest.mark.parametrize(
     ("light", "color", "count"),
-    [("Ke 0 7 0", GREEN, 0), ("Ke 0 0 0\nmap_Ke t.png", WHITE, 1), ("Ke 0.0 0 0", (0, 0, 0), 0)],
+    [
+        ("Ke 0 7 0", GREEN, 0),
+        ("Ke spectral a.rfl", (0, 0, 0), 0),
+        ("Ke 0 0 0\nmap_Ke t.png", WHITE, 1),
+        ("Ke 0.0 0 0", (0, 0, 0), 0),
+    ],
 )
 def test_the_light_of_a_black_material_is_its_color(tmp_path, light, color, count):
     """Blender writes a texture without shading like this."""
