@@ -309,11 +309,16 @@ class SignalHandler:
                     self._handlers[number] = signal.signal(number, self._note)
         return self
 
-    def __exit__(self, error: type[BaseException] | None, *rest: object) -> None:
+    def __exit__(
+        self, error: type[BaseException] | None, value: BaseException | None, *rest: object
+    ) -> None:
         """Restore the handlers, and let a noted signal take effect unless an error is raised."""
         self._restore()
         if error is None and self._number is not None:
             signal.raise_signal(self._number)
+        # A job sends the signal to all its processes, also to those that read images.
+        if self._number is not None and "DataLoader worker" in str(value):
+            self.stop()
 
     def requested(self) -> bool:
         """Return whether the run should stop, because one of its processes got a signal.

@@ -20,7 +20,7 @@ from augment.scene.scene import Scene
 from tests.runs import completed_run
 from train import checkpoints, run_folder
 from train.cli import read_settings
-from train.device import SignalHandler, process_group, wrap_ddp
+from train.device import Interrupted, SignalHandler, process_group, wrap_ddp
 from train.run_folder import read_metrics
 from train.settings import ExperimentSettings
 
@@ -185,6 +185,13 @@ def test_torchrun_trains_one_run_and_a_signal_tells_how_to_go_on(tiny_npz, tmp_p
     assert f"after epoch {epochs}" in done.stdout
     assert done.stdout.count("| adversarial") == 1
     assert [line.get("epoch") for line in read_metrics(folder)] == [*range(1, 21), None]
+
+
+def test_the_end_of_a_worker_by_the_same_signal_ends_the_process_as_the_signal_does():
+    with pytest.raises(Interrupted) as ended, SignalHandler():
+        signal.raise_signal(signal.SIGINT)
+        raise RuntimeError("DataLoader worker (pid 7) is killed by signal: Interrupt.")
+    assert ended.value.code == 128 + signal.SIGINT
 
 
 @pytest.mark.parametrize("error", [None, ZeroDivisionError])

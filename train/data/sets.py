@@ -144,7 +144,9 @@ class ImageFiles:
         errors: ReadErrors = {}
         options: dict[str, Any] = {"num_workers": self.workers, "collate_fn": _collate}
         # Otherwise, each loader draws from the global generator, also when a run is resumed.
-        options |= {"generator": torch.Generator(), "worker_init_fn": _outlive_signal}
+        options["generator"] = torch.Generator()
+        if signal.getsignal(signal.SIGTERM) != signal.SIG_DFL:
+            options["worker_init_fn"] = _outlive_signal
         loader: DataLoader = DataLoader(_Reader(self), batch_sampler=list(batches), **options)
         for images, errors_in_batch in loader:
             errors |= errors_in_batch

@@ -179,7 +179,7 @@ class Skylight(Parameter):
         """Return zenith angle and azimuth in degrees, and turbidity, by name."""
         units = self._sun, self._sun, TURBIDITY_UNIT
         return {
-            name: value * unit
+            name: round(value * unit, 4)
             for name, value, unit in zip(SKY, values.tolist(), units, strict=True)
         }
 

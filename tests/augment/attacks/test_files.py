@@ -30,7 +30,7 @@ def test_the_lines_of_an_attack_on_the_sky_tell_its_sun(attacked, tmp_path):
     sky = sky_coefficients(**line["sky"]).numpy()
     shown = json.loads((tmp_path / "example_000" / "light.json").read_text())["coefficients"]
     scale = np.linalg.norm(shown) / np.linalg.norm(sky)
-    assert np.abs(scale * sky - shown).max() < 1e-6
+    assert np.abs(scale * sky - shown).max() < 1e-5
 
 
 @pytest.mark.parametrize("margin", [0.5, 100.0])

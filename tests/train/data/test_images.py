@@ -12,6 +12,7 @@ from tests.helpers import save_plain
 from train.data.batches import Round, TrainingImages, training_batches
 from train.data.photographs import find_unlabeled, load_photographs
 from train.data.sets import ImageFiles, Split, load_folder, load_unlabeled
+from train.device import SignalHandler
 
 SIZE = 72
 
@@ -68,10 +69,11 @@ def test_crops_are_parts_of_the_image_by_their_seeds_whatever_the_number_of_proc
 
 def test_a_signal_that_all_processes_of_a_job_get_does_not_end_those_that_read_images(files):
     reading = replace(files, workers=1).squares(torch.zeros(40, 1, dtype=torch.int64))
-    images = [next(reading)]
-    for process in multiprocessing.active_children():
-        process.terminate()
-    assert len([*images, *reading]) == 40
+    with SignalHandler():
+        images = [next(reading)]
+        for process in multiprocessing.active_children():
+            process.terminate()
+        assert len([*images, *reading]) == 40
 
 
 def test_reading_images_draws_nothing_from_the_global_generator(files):
