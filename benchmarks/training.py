@@ -177,7 +177,7 @@ class PlainLoop:
         self.loader = make_loader(pixels, labels, options)
         network = make_network(class_count, options)
         float32 = deepcopy(network).to(self.device).train()
-        bfloat16 = deepcopy(network).to(self.device).train()
+        bfloat16 = deepcopy(float32).to(memory_format=torch.channels_last)
         self.networks: Mapping[str, nn.Module | None] = {
             "float32": float32,
             "bfloat16": MixedPrecision(bfloat16, "bfloat16"),

@@ -424,8 +424,9 @@ def showing(
     """Extend the clipping range of cameras that have the default, so that they show all faces."""
     # A bound of the distance from the origin, which is enough for normalized meshes.
     radius = math.sqrt(3) * float(np.abs(vertices).max(initial=0))
-    if radius > CLIP_RANGE:
-        radius = float(np.linalg.norm(vertices[faces], axis=-1).max(initial=0))
+    if not CLIP_RANGE < radius < math.inf:
+        return list(cameras)
+    radius = float(np.linalg.norm(vertices[faces], axis=-1).max(initial=0))
     return [
         camera.with_clip_range(radius) if camera.clip_range == CLIP_RANGE else camera
         for camera in cameras

@@ -222,7 +222,8 @@ def fit_photograph(
         image = window.cut(photograph, size, encoding)
         # Share of each pixel that the object covers, shape (size, size).
         coverage = window.cut(mask[..., None], size, beyond=0)[0]
-        return fit_scene(image, coverage, mesh, fov=fov, encoding=encoding, start=start, **options)
+        camera = {"fov": fov} if start is None else {"start": start}
+        return fit_scene(image, coverage, mesh, encoding=encoding, **camera, **options)
 
     # The window needs the direction of the world's z-axis in the axes of the photograph's camera:
     # right, up and back. For the first fit, this direction is guessed.

@@ -46,7 +46,6 @@ UNFIT_TEXTS = "all_but_last", "augmix", "color_jitter+augmix", "pgd", "trivial_a
 
 
 @torch.inference_mode(False)  # Training needs autograd.
-@torch.enable_grad()
 def harden(
     network: nn.Module,
     meshes: Sequence[class_names.MeshItem],
