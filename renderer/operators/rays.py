@@ -28,7 +28,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from renderer.errors import import_package
+from renderer.errors import import_package, require_bounded, require_shape
 from renderer.light.basis import LightPaths, LocalBasis
 from renderer.light.harmonics import cache_tensors
 from renderer.mesh import Mesh
@@ -489,6 +489,9 @@ class LocalLightView:
         # None if the lights stay in place. Their paths to the samples are then kept for later
         # renders.
         moved = positions.cpu().double() if basis.is_movable and positions is not None else None
+        if moved is not None:
+            require_shape("positions", moved, len(light), 3)
+            require_bounded(positions=moved)
         paths = self.fixed_paths.get(basis) if moved is None else None
         if paths is None:
             samples = surface.points, surface.normals, surface.planes

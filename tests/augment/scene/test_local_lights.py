@@ -122,6 +122,13 @@ def test_a_joint_attack_lowers_the_cost_and_is_read_back_to_its_image(joint_atta
     torch.testing.assert_close(image, done.images[0], rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize("wrong", [torch.full((2, 2, 3), torch.nan), torch.ones(2, 1, 3)])
+def test_positions_of_other_lamps_than_those_of_the_scene_are_refused(wrong):
+    shown = scene()
+    with pytest.raises(InputError, match="positions"):
+        shown.render(Conditions(shown.lights, positions=wrong), BOTH)
+
+
 def test_an_attacked_pattern_is_written_as_an_image_and_moved_lamps_where_they_ended(joint_attack):
     done, written, folder = joint_attack
     image = str(folder / "projector.png")
