@@ -199,6 +199,20 @@ def require_same_inputs(
             raise InputError(f"{path} has changed since {folder} began: {advice}")
 
 
+def require_same_weights(
+    folder: Path, hashes: Mapping[str, str], names: Mapping[str, str], recorded: Mapping[Any, Any]
+) -> None:
+    """Check that networks have the weights with which a folder began, by the hashes in its facts.
+
+    The networks are found by the same keys in `hashes`, in `names` and in the facts.
+    """
+    known = recorded.get("hashes") or {}
+    for key, found in hashes.items():
+        if known.get(key, found) != found:
+            fault = f"{names[key]} has other weights than when {folder} began"
+            raise InputError(f"{fault}: put them back, or set another out=")
+
+
 def mapped(value: Any, change: Callable[[str], str]) -> Any:
     """Return a copy of nested settings in which a function has replaced each text.
 

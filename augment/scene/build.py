@@ -498,8 +498,9 @@ def expose(scene: Scene) -> Scene:
         if rows:
             mean = encode(clamp(values * factors[-1] + local), scene.settings.encoding).mean()
             said = f"{item.name}: exposure={factors[-1]:.3g}, at which its mean is {mean:.2g}"
-            reason = f", because projector and lamps alone exceed {aim:.2g}: lower their power"
-            say_once(said + reason * is_above)
+            if is_above:
+                said += f", because projector and lamps alone exceed {aim:.2g}: lower their power"
+            say_once(said)
     examples = [
         replace(example, exposure=example.exposure * factors[example.object])
         for example in scene.examples

@@ -231,6 +231,21 @@ def _library(names: list[str], file: MeshFile) -> dict[str, _Definition] | None:
     return library if names else None
 
 
+def _emitted(properties: list[tuple[str, str]]) -> set[str]:
+    """Return the properties with the light of a material that is black otherwise, in lower case.
+
+    Blender writes a texture without shading in this way.
+    """
+    texts = {keyword.lower(): text.partition("#")[0] for keyword, text in properties}
+    if "map_kd" in texts or texts.get("kd", "1").strip("0. "):
+        return set()
+    emitted = {key for key in ("ke", "map_ke") if texts.get(key, "").strip("0. ")}
+    # Words such as "spectral" are no numbers.
+    if not re.fullmatch(r"(\s*[\d.]+(e[+-]?\d+)?){3}\s*", texts.get("ke", ""), re.IGNORECASE):
+        emitted.discard("ke")
+    return emitted
+
+
 def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile) -> _Material:
     """Find the color and the texture of a material among its properties in the library."""
     if library is None:
@@ -243,11 +258,7 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
     folder, is_linear, properties = definition
     material = _Material()
     color_key, texture_key = "kd", "map_kd"
-    texts = {keyword.lower(): text.partition("#")[0] for keyword, text in properties}
-    emitted = {key for key in ("ke", "map_ke") if texts.get(key, "").strip("0. ")}
-    if not re.fullmatch(r"(\s*[\d.]+(e[+-]?\d+)?){3}\s*", texts.get("ke", ""), re.IGNORECASE):
-        emitted.discard("ke")
-    if emitted and "map_kd" not in texts and not texts.get("kd", "1").strip("0. "):
+    if emitted := _emitted(properties):
         file.assume("the light that a black material emits is taken as its color")
         color_key, texture_key = "ke", "map_ke"
         unused = {"kd", "ke", "map_ke"} - emitted

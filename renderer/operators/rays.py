@@ -504,9 +504,8 @@ class LocalLightView:
         if surface.gloss is not None and is_moving:
             seen = replace(surface.fragments, cameras=shown.cameras)
             surface = replace(surface, fragments=seen)
-        arriving = light.cpu().double()[paths.function]
-        if is_moving:
-            arriving = basis.arriving(light.cpu().double(), paths, surface.points)
+        points = surface.points if is_moving else surface.points.detach()
+        arriving = basis.arriving(light.cpu().double(), paths, points)
         # Irradiance at the end of each path: one row for each path, one column for each color.
         irradiance = paths.irradiance[:, None] * arriving
         radiance = path_reflectance(surface, albedo.cpu().double(), paths) / shown.samples**2

@@ -224,7 +224,7 @@ def attacks(
         if adversary.pixels is not None:
             raise InputError(f"reload={settings.reload} has changed pixels: give another")
         if settings.attack.skylight:
-            line = "the sky starts at attack.skylight: give the values of sky in attack.jsonl there"
+            line = "the sky starts at attack.skylight: give it the values of sky in attack.jsonl"
             console.warning(line)
         # An attack on the pose needs them, and images stay the same.
         silhouettes = adversary.settings.silhouettes or settings.renderer.silhouettes

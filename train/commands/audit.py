@@ -47,7 +47,7 @@ from train.laboratory.laboratory import write_laboratory
 from train.results.overwrite import require_replaceable
 from train.results.page import PAGE
 from train.results.scoring import Predictor, evaluate_photographs
-from train.run_config import CONFIG, read_config, require_same, write_config
+from train.run_config import CONFIG, read_config, require_same, require_same_weights, write_config
 from train.run_folder import read_json, sole_writer, writable_folder
 from train.settings import LABORATORY, OTHER_PREFIX, PHOTOGRAPHS, published_folder, read_objects
 from train.system import command_line
@@ -512,10 +512,8 @@ def _prepare_folder(settings: AuditSettings, out: Path, renders: Path, networks:
         recorded = require_same(
             out, settings, "out=", lambda key, old, _: old is None and key in SETTABLE_LATER
         )
-        for key, found in hashes.items():
-            if (recorded.get("hashes") or {}).get(key, found) != found:
-                fault = f"{networks[key].name} has other weights than when {out} began"
-                raise InputError(f"{fault}: set another out=, or overwrite=true")
+        names = {key: network.name for key, network in networks.items()}
+        require_same_weights(out, hashes, names, recorded)
     write_config(out, settings, command=command_line("audit"), hashes=hashes)
 
 

@@ -36,8 +36,8 @@ from train.training.run_log import Logger
 
 # Values of some settings of a group, such as "train", by name. None for the defaults.
 Section = Mapping[str, Any] | None
-# Settings `train` that a detector cannot have, unless they are off or texts other than these, which
-# need logits or move what a box surrounds.
+# Settings of `train` that a detector cannot use, because they need logits or move what a box
+# surrounds. Of the values that are texts, only UNFIT_TEXTS are refused.
 UNFIT_SETTINGS = (
     *("augmentation", "freeze", "interpolate"),
     *("label_smoothing", "ranking_weight", "relight_steps"),
@@ -191,7 +191,8 @@ def harden(
             raise InputError(f"{fault}: give an nb.Classifier instead", "train.recognize")
         for name in UNFIT_SETTINGS if is_detector else ():
             value = getattr(settings.train, name)
-            if value in UNFIT_TEXTS if isinstance(value, str) else value:
+            is_unfit = value in UNFIT_TEXTS if isinstance(value, str) else bool(value)
+            if is_unfit:
                 fault = f"train.{name}={value} is for classifiers"
                 raise InputError(f"{fault}: choose another value", f"train.{name}")
         require_new_run(folder, "out", overwrite, settings.train.resume)

@@ -124,8 +124,11 @@ class Matches:
 
     def false_per_image(self, threshold: float, counts: Counts) -> Float[np.ndarray, " k"]:
         """Compute the number of detections per image that have a score, but no object."""
-        is_false = (self.score >= threshold) & ~self.is_right
-        return counts[:, self.image[is_false]].sum(-1) / counts.sum(-1)
+        return counts[:, self.images_of_false(threshold)].sum(-1) / counts.sum(-1)
+
+    def images_of_false(self, threshold: float) -> Int[np.ndarray, " false"]:
+        """Return the index of the image of each detection that has a score, but no object."""
+        return self.image[(self.score >= threshold) & ~self.is_right]
 
     def average_precision(self, counts: Counts) -> Float[np.ndarray, " k"]:
         """Compute the average precision of one class, as COCO does. That of no object is NaN."""
@@ -237,8 +240,7 @@ def score(
     odds = estimate(false_odds, [np.arange(joined.image_count)], units)
     ends = (odds.value, odds.low, odds.high)
     value, low, high = (None if end is None else end / (1 - end) for end in ends)
-    is_false = (joined.score >= threshold) & ~joined.is_right
-    numbers = np.bincount(joined.image[is_false], minlength=joined.image_count)
+    numbers = np.bincount(joined.images_of_false(threshold), minlength=joined.image_count)
     if low is not None and numbers.any() and not np.ptp(numbers):
         from scipy.special import gammaincinv
 

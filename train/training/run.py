@@ -29,7 +29,7 @@ from train.results.metrics import METRICS
 from train.results.overwrite import remove_run
 from train.results.predictions import SUMMARY
 from train.results.scoring import Model, Predictor, evaluate_photographs, format_scores
-from train.run_config import CONFIG, require_same_run, write_config
+from train.run_config import CONFIG, require_same_run, require_same_weights, write_config
 from train.run_folder import BEFORE, BEST, WEIGHTS
 from train.settings import KEPT_ASIDE, LABORATORY, WIDERESNET, ExperimentSettings, in_light
 from train.training import inputs
@@ -99,9 +99,9 @@ class Run:
                 raise InputError(f"out={folder} holds a run already: {advice}")
         self._is_resumed = earlier is not None
         self._hashes = {"network": checkpoints.hash_weights(initial.weights)} if initial else {}
-        if earlier is not None and self._hashes != (earlier.get("hashes") or self._hashes):
-            fault = f"network={settings.network} has other weights than when {folder} began"
-            raise InputError(f"{fault}: put them back, or set another out=")
+        if earlier is not None:
+            names = {"network": f"network={settings.network}"}
+            require_same_weights(folder, self._hashes, names, earlier)
         # The number of threads changes the last bits of the results, so a resumed run keeps it.
         known = None if earlier is None else OmegaConf.select(earlier, "hardware.threads")
         threads = settings.train.threads or known

@@ -150,7 +150,8 @@ class Skylight(Parameter):
 
         self._window = nonnegative_window(HARMONICS.degree) if nonnegative else None
         self._sun = settings.sun
-        units = torch.tensor([self._sun, self._sun, TURBIDITY_UNIT], dtype=torch.float64)
+        self._units = self._sun, self._sun, TURBIDITY_UNIT
+        units = torch.tensor(self._units, dtype=torch.float64)
         initial = units.new_tensor([getattr(settings, name) for name in SKY])
         start = (initial / units).to(scene.lights)
         # The sky model is defined for all azimuths, but not for all zenith angles and turbidities.
@@ -177,11 +178,8 @@ class Skylight(Parameter):
 
     def described(self, values: Float[Tensor, " 3"]) -> dict[str, float]:
         """Return zenith angle and azimuth in degrees, and turbidity, by name."""
-        units = self._sun, self._sun, TURBIDITY_UNIT
-        return {
-            name: round(value * unit, 4)
-            for name, value, unit in zip(SKY, values.tolist(), units, strict=True)
-        }
+        parts = zip(SKY, values.tolist(), self._units, strict=True)
+        return {name: round(value * unit, 4) for name, value, unit in parts}
 
 
 class Positions(Parameter):
