@@ -89,6 +89,7 @@ class AdversarialLighting:
         self.forward_passes, self.backward_passes = steps + 1, steps
         self.lighting = RandomLighting(lights, strength=strength)
 
+    @torch.compiler.disable  # type: ignore[untyped-decorator, unused-ignore]
     def __call__(
         self, images: Shaped[Tensor, "N C H W"], targets: Any = None
     ) -> Shaped[Tensor, "N C H W"]:

@@ -28,6 +28,8 @@ PROMPT = "a photo of a {}"
 PROBED = (600, 300)
 # Logits of a zero-shot network may differ by this much from those of transformers.
 TOLERANCE = 1e-3
+# A repository may have Python code of its own, about which transformers would ask on the terminal.
+NO_CODE = {"trust_remote_code": False}
 # Tasks of transformers whose models the library reads.
 _TASKS = (
     *("IMAGE_CLASSIFICATION", "OBJECT_DETECTION", "IMAGE_SEGMENTATION"),
@@ -66,7 +68,7 @@ def load(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool)
     library = import_package("transformers", name, '"parametric-norm-balls[hf]"')
     advice = "give a folder that save_pretrained wrote, or a repository of the Hugging Face Hub"
     with reading_network(name, "cannot be read", advice):
-        config = library.AutoConfig.from_pretrained(model)
+        config = library.AutoConfig.from_pretrained(model, **NO_CODE)
     # Name of the class of the network, by which its task is known.
     architecture = (config.architectures or [""])[0]
     auto = library.models.auto.modeling_auto
@@ -113,7 +115,7 @@ def _model(kind: Any, model: str, config: Any, name: str, is_random: bool) -> An
     if is_random:
         return kind._from_config(config)
     with reading_network(name, "cannot be loaded", "check the files of its weights"):
-        loaded, report = kind.from_pretrained(model, output_loading_info=True)
+        loaded, report = kind.from_pretrained(model, output_loading_info=True, **NO_CODE)
     if missing := sorted(report["missing_keys"]):
         reason = f"lacks weights, such as {missing[0]}"
         raise name_error(name, f"{reason}: give a trained {kind.__name__}")
@@ -130,7 +132,7 @@ def _read_preprocessor(
     the channels count, however the processor defines them.
     """
     try:
-        processor: Any = library.AutoImageProcessor.from_pretrained(model)
+        processor: Any = library.AutoImageProcessor.from_pretrained(model, **NO_CODE)
         # This file states how the images of a network are prepared.
         source: str | None = "preprocessor_config.json"
     except (OSError, ValueError):
@@ -185,7 +187,7 @@ def _zero_shot(
         options = {"padding": "max_length", "max_length": 64, "truncation": True}
     # Its tokenizer may lack files, or the model may be of another kind.
     with reading_network(f"hf:{name}", "is no zero-shot network like CLIP", "use another network"):
-        tokenizer = library.AutoTokenizer.from_pretrained(name)
+        tokenizer = library.AutoTokenizer.from_pretrained(name, **NO_CODE)
         tokens = tokenizer(prompts, return_tensors="pt", **options)
         output = model.eval()(pixel_values=gray, **tokens)
         # Unit vectors of the prompts, times the scale of the model, shape (C, D).

@@ -229,6 +229,16 @@ class Flat(nn.Sequential):
         super().__init__(nn.Flatten(), nn.Linear(3 * 16 * 16, 2))
 
 
+@pytest.mark.filterwarnings("ignore:Dynamo detected")  # The tests check shapes.
+def test_a_compiled_step_leaves_the_search_out(images):
+    relight = nb.AdversarialLighting(Mean(), steps=1)
+    graphs = []
+    # The compiler shows each of its graphs to the backend.
+    compiled = torch.compile(lambda x: relight(x) * 2, backend=lambda g, _: graphs.append(g) or g)
+    assert torch.equal(seeded(compiled, images), seeded(relight, images) * 2)
+    assert len(graphs) == 1
+
+
 @pytest.mark.filterwarnings("ignore:.torch.jit.script:FutureWarning")
 def test_scripted_networks_are_searched_like_others(images):
     model = Flat()

@@ -1,5 +1,6 @@
 """Networks of transformers: loaded from a folder, they give what its own pipelines give."""
 
+import json
 import logging
 import re
 import shlex
@@ -284,3 +285,14 @@ def test_missing_weights_are_refused(save, tmp_path):
     safetensors.torch.save_file(state, path, {"format": "pt"})
     with pytest.raises(InputError, match=r"classifier\.weight"):
         nb.load_classifier(f"hf:{folder}")
+
+
+def test_code_of_a_repository_is_not_run_even_if_the_user_would_agree(tmp_path, monkeypatch):
+    code = {"AutoConfig": "code.Config", "AutoModelForImageClassification": "code.Network"}
+    config = {"architectures": ["Network"], "model_type": "own", "auto_map": code}
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    (tmp_path / "code.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    monkeypatch.setattr("builtins.input", lambda *_: "y")
+    with pytest.raises(InputError):
+        nb.load_classifier(f"hf:{tmp_path}")
+    assert not (tmp_path / "ran").exists()
