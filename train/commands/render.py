@@ -1,6 +1,7 @@
 """pnb-render: labeled renders on disk, as a data set for other programs."""
 
 import json
+import math
 from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 from augment import dataset
 from augment.progress import progress
 from renderer.errors import InputError, keyed, keys_of
+from renderer.settings import height_and_width
 from train import console
 from train.checkpoints import load_chosen
 from train.class_names import name_of_mesh
@@ -23,6 +25,10 @@ from train.settings import label_names, read_objects
 # Processes that share a data set differ in these settings only.
 CIRCUMSTANCES = ("out", "shard", "shards", "device", "trust")
 DEFAULT_SIZE = 224
+# Bytes of a pixel in the files of a render before compression, by the name of the map, and bytes of
+# the details of a render with the headers of its files.
+BYTES = {"image": 3, "mask": 1, "depth": 2, "normals": 3}
+DETAILS = 10_000
 
 
 def run(settings: RenderSettings) -> None:
@@ -71,7 +77,10 @@ def run(settings: RenderSettings) -> None:
         renders = dataset.render_dataset(objects, settings.size, len(indices), **options)
     # A command whose meshes cannot be read leaves no settings in the folder.
     _describe(settings, folder, classes)
-    print(f"{folder}: {missing} of {settings.count} renders to do")
+    height, width = height_and_width(settings.size)
+    bytes_of_pixel = sum(BYTES[name] for name in ("image", *settings.maps))
+    megabytes = math.ceil(missing * (height * width * bytes_of_pixel + DETAILS) / 1e6)
+    print(f"{folder}: {missing} of {settings.count} renders to do, at most {megabytes:,} MB")
     data.write(progress(renders, "renders", missing))
     # Of several processes, the one that finishes last writes the files about all renders.
     if data.is_finished():

@@ -1,5 +1,6 @@
 import json
 import math
+import re
 import tarfile
 from collections import Counter
 from collections.abc import Iterator
@@ -180,6 +181,17 @@ def test_maps_of_renders_do_not_need_the_default_type_of_torch(meshes):
         torch.set_default_dtype(torch.float32)
     lengths = render.normals.norm(dim=0)[render.masks[0]]
     torch.testing.assert_close(lengths, torch.ones_like(lengths, dtype=torch.float32))
+
+
+@pytest.mark.parametrize("format", ["webdataset", "coco"])
+def test_the_disk_space_that_is_announced_is_not_exceeded(meshes, tmp_path, capsys, format):
+    augment = RenderSettings(out="unused").augment
+    augment.vary.camera.noise = 1.0  # Noise cannot be compressed.
+    options = {"count": 4, "size": 160, "format": format, "maps": MAPS, "augment": augment}
+    out = write(meshes, tmp_path / "out", **options)
+    written = sum(path.stat().st_size for path in out.rglob("*.*"))
+    announced = 1e6 * int(re.search(r"at most (\d+) MB", capsys.readouterr().out)[1])
+    assert announced / 4 < written <= announced
 
 
 def test_a_tar_file_has_the_same_pictures_as_a_folder(meshes, written, tmp_path):
