@@ -119,7 +119,7 @@ class ProjectorSettings(Settings):
     distance: float = setting(4.0, "Its distance in world units.", within=(2, MAX_SCALE))
     fov: float = setting(30.0, "Its field of view.", "degrees", within=(0.1, 170))
     power: float = setting(1.0, "Largest value of a pixel.", within=(1 / MAX_SCALE, MAX_SCALE))
-    pattern: Any = setting(0.0, "Initial pattern: a gray value in [0, 1] or an image file.")
+    pattern: Any = setting(0.0, "Start: gray in [0, 1], or a file of linear values.")
 
 
 @dataclass
