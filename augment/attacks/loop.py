@@ -21,15 +21,12 @@ from torch import Tensor
 
 from augment.attack_settings import GRADIENT
 from augment.attacks.objective import NOISE_DRAWS, Examples, Images, Objective, Score, Values
-from augment.attacks.optimizers import KINDS, Evaluation, Optimizer, Problem, chosen
+from augment.attacks.optimizers import FOUND, KINDS, Evaluation, Optimizer, Problem, chosen
 from augment.network import frozen_eval_mode, say_once
 from augment.progress import progress
 from augment.scene.truth import Rows
 from renderer.errors import Check, ShortRepr, late_checks, raise_first
 from renderer.modes import without_autocast
-
-# Fields of a `Minimum` that belong to the returned candidate: the keys of `Evaluation.found`.
-FOUND = ("values", "images", "success", "cost", "predicted")
 
 
 def drop_period(device: torch.device) -> int:
