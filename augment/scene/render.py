@@ -333,12 +333,12 @@ class DirectRenderer:
         self._views: dict[tuple[int, tuple[Camera, ...]], tuple[Fragments, Tensor]] = {}
         # Views of unmoved objects that were prepared for the light of projector and lamps.
         self._local_views: dict[tuple[int, Camera], LocalLightView] = {}
-        # Ray tracers, and shadows and bounces, of unmoved objects by their indices.
+        # Ray tracers of unmoved objects by their indices.
         self._rays = [Rays(item.mesh) for item in self.objects]
-        self._transport_of_object: dict[int, FrozenTransport] = {}
-        # Shadows and bounces of moved shapes, by the indices of their examples and objects. Scenes
-        # with other examples of the same objects may share this renderer.
-        self._transport_of_example: dict[tuple[int, int], FrozenTransport] = {}
+        # Shadows and bounces: of unmoved objects by their indices, and of moved shapes by those of
+        # their examples and objects. Scenes with other examples of the same objects may share this
+        # renderer.
+        self._transports: dict[int | tuple[int, int], FrozenTransport] = {}
 
     @cached_property
     def vertices(self) -> list[Tensor]:
@@ -544,16 +544,16 @@ class DirectRenderer:
         def trace(mesh: Mesh) -> FrozenTransport:
             return FrozenTransport(mesh, self.settings, item.albedo_scale, self.basis)
 
+        kept = self._transports
         # The light paths of the unmoved mesh are traced once.
-        frozen = self._transport_of_object.get(object_index) or trace(item.mesh)
-        self._transport_of_object[object_index] = frozen
-        if not frozen.is_near(positions):
-            key = (example, object_index)
-            frozen = self._transport_of_example.get(key, frozen)
-            if not frozen.is_near(positions):
-                frozen = trace(replace(item.mesh, vertices=positions))
-            self._transport_of_example[key] = frozen
-        return frozen
+        if object_index not in kept:
+            kept[object_index] = trace(item.mesh)
+        if kept[object_index].is_near(positions):
+            return kept[object_index]
+        key = (example, object_index)
+        if key not in kept or not kept[key].is_near(positions):
+            kept[key] = trace(replace(item.mesh, vertices=positions))
+        return kept[key]
 
     def _rasterize(
         self,

@@ -137,9 +137,8 @@ class Scene:
         self.attack_bytes = self._count_attack_bytes()
         # Images are numbered by example and then by view: e · V + v.
         built_with: dict[str, Any] = {"rasterizer": rasterizer, "basis": basis}
-        if device.type == "cuda":
-            # On other devices, operators are computed on the CPU, and their stacks are moved.
-            built_with["device"] = device
+        # On devices other than CUDA, operators are computed on the CPU, and their stacks are moved.
+        built_with["device"] = device if device.type == "cuda" else "cpu"
         self._operator_renderer = OperatorRenderer(
             self.objects,
             [(item.object, camera) for item in self.examples for camera in item.cameras],
@@ -538,9 +537,8 @@ class Scene:
             groups = progress(list(groups), "rendering views")
         for group in groups:
             rows = group.rows
-            numbers_behind = [self.examples[numbers[row]].background for row in rows]
-            behind = torch.cat([self.backgrounds[each] for each in numbers_behind], dim=1)
-            background = behind.flatten(1)
+            behind = self.backgrounds[[self.examples[numbers[row]].background for row in rows]]
+            background = behind.transpose(0, 1).flatten(1)
             light = group.changed.light
             if rows[0] != rows[-1]:
                 light = torch.stack([conditions.light[row] for row in rows])
