@@ -113,11 +113,10 @@ class SceneProblem:
         that are as long as those of an attack. `reached` are the values at the end of this attack.
         They are needed only if a parameter has no radius.
         """
-        samples = []
-        for parameter, part in self.split_by_parameter(self.start if reached is None else reached):
-            sample = parameter.sample(generator, None if reached is None else part)
-            samples.append(sample.to(self.start))
-        return torch.cat(samples, dim=1)
+        parts = self.split_by_parameter(self.start if reached is None else reached)
+        given = [(each, None if reached is None else part) for each, part in parts]
+        samples = [parameter.sample(generator, part) for parameter, part in given]
+        return torch.cat(samples, dim=1).to(self.start)
 
     def split_by_parameter(self, values: Values) -> list[tuple[Parameter, Tensor]]:
         """Split the attack values of examples into the values of each parameter."""

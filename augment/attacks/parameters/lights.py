@@ -149,8 +149,7 @@ class Skylight(Parameter):
         self._scale = torch.tensor(scales, dtype=torch.float64, device=scene.lights.device)
 
         self._window = nonnegative_window(HARMONICS.degree) if nonnegative else None
-        self._sun = settings.sun
-        self._units = self._sun, self._sun, TURBIDITY_UNIT
+        self._units = settings.sun, settings.sun, TURBIDITY_UNIT
         units = torch.tensor(self._units, dtype=torch.float64)
         initial = units.new_tensor([getattr(settings, name) for name in SKY])
         start = (initial / units).to(scene.lights)
@@ -165,7 +164,7 @@ class Skylight(Parameter):
         The values are zenith angle, azimuth and turbidity, each divided by its unit.
         """
         # Convert the angles to degrees in float64, so that rounding is negligible.
-        zenith, azimuth = (values[:, :2].double() * self._sun).unbind(1)
+        zenith, azimuth = (values[:, :2].double() * self._units[0]).unbind(1)
         turbidity = values[:, 2] * TURBIDITY_UNIT
         sky = sky_coefficients(zenith, azimuth, turbidity)
         sky = sky * self._scale[examples, None, None]
