@@ -215,7 +215,8 @@ class Group(NamedTuple):
         views: Number of each view among those of its example.
         object: Index of the object.
         cameras: Camera of each view.
-        changed: Conditions of the first row, which differ from the others in the light only.
+        changed: Conditions of the rows, which differ in the light only. If there are several rows,
+            each view has a light, shape (N, K, 3).
     """
 
     rows: tuple[int, ...]
@@ -452,12 +453,7 @@ class DirectRenderer:
         return views_at_once(self.settings, self.like, casts_rays)
 
     def radiance(
-        self,
-        example: int,
-        group: Group,
-        light: Float[Tensor, "*views K 3"],
-        background: Float[Tensor, "_ pixels"],
-        is_draft: bool = False,
+        self, example: int, group: Group, background: Float[Tensor, "_ pixels"], is_draft: bool
     ) -> PixelRadiance:
         """Render `views_at_once` views of an object with changed shape, colors, gloss or lamps.
 
@@ -488,7 +484,7 @@ class DirectRenderer:
         gloss = None
         if changed.gloss is not None:
             gloss = Gloss(*changed.gloss.unbind(1), textured=True)
-        split = split_light(self.basis, light)
+        split = split_light(self.basis, changed.light)
         # Projector and lamps need rays for their shadows. For an unmoved object with its own
         # gloss, the view is prepared once.
         lamp_view = None

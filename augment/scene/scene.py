@@ -539,10 +539,7 @@ class Scene:
             rows = group.rows
             behind = self.backgrounds[[self.examples[numbers[row]].background for row in rows]]
             background = behind.transpose(0, 1).flatten(1)
-            light = group.changed.light
-            if rows[0] != rows[-1]:
-                light = torch.stack([conditions.light[row] for row in rows])
-            shown = numbers[rows[0]], group, light, background, is_draft
+            shown = numbers[rows[0]], group, background, is_draft
             pixels, coverage, radiance = self._direct_renderer.radiance(*shown)
             # Pixels at the border of the object show a part of the background.
             seen_background = background.index_select(1, pixels)
@@ -574,6 +571,9 @@ class Scene:
             while group := list(islice(of_mesh, at_once)):
                 rows, views = zip(*group, strict=True)
                 changed = conditions.row(rows[0], self.objects[index].mesh)
+                if rows[0] != rows[-1]:
+                    light = torch.stack([conditions.light[row] for row in rows])
+                    changed = replace(changed, light=light)
                 of_views = tuple(cameras[row][view] for row, view in group)
                 yield Group(rows, views, index, of_views, changed)
 
