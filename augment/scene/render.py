@@ -437,13 +437,9 @@ class DirectRenderer:
 
     def _seen(self, group: Group) -> tuple[Mesh, Fragments, tuple[Camera, ...]]:
         """Return the mesh of a group, what its cameras see, and the cameras as numbers."""
-        vertices = group.changed.vertices
-        mesh = _moved(self.objects[group.object].mesh, vertices)
-        cameras = tuple(camera.fixed() for camera in group.cameras)
-        if vertices is None:
-            return mesh, self.view(group.object, *cameras)[0], cameras
-        fragments, _ = self._rasterize(group.object, cameras, vertices, self.settings)
-        return mesh, fragments, cameras
+        mesh = _moved(self.objects[group.object].mesh, group.changed.vertices)
+        fragments, _ = self._rasterized(group, self.settings)
+        return mesh, fragments, tuple(camera.fixed() for camera in group.cameras)
 
     def views_at_once(self) -> int:
         """Return how many views `radiance` renders at once. Rays and silhouettes need one."""
@@ -473,10 +469,7 @@ class DirectRenderer:
         settings = self.settings
         if has_draft:
             settings = replace(settings, samples=min(settings.samples, DRAFT_SAMPLES))
-        if moved is None:
-            rasterized = self.view(object_index, *fixed_cameras)
-        else:
-            rasterized = self._rasterize(object_index, fixed_cameras, moved, settings)
+        rasterized = self._rasterized(group, settings)
         fragments, albedo = rasterized
         if changed.albedo is not None:
             of_view = (item.mesh, fragments, settings.encoding, item.albedo_scale)
@@ -550,6 +543,13 @@ class DirectRenderer:
         if key not in kept or not kept[key].is_near(positions):
             kept[key] = trace(replace(item.mesh, vertices=positions))
         return kept[key]
+
+    def _rasterized(self, group: Group, settings: ImageSettings) -> tuple[Fragments, Tensor]:
+        """Find the samples that the cameras of a group see, and their albedo (S, 3)."""
+        cameras = tuple(camera.fixed() for camera in group.cameras)
+        if group.changed.vertices is None:
+            return self.view(group.object, *cameras)
+        return self._rasterize(group.object, cameras, group.changed.vertices, settings)
 
     def _rasterize(
         self,
