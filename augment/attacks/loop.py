@@ -28,6 +28,9 @@ from augment.scene.truth import Rows
 from renderer.errors import Check, ShortRepr, late_checks, raise_first
 from renderer.modes import without_autocast
 
+# Fields that also count what restarts take.
+COUNTS = ("steps", "queries", "backward_passes")
+
 
 def drop_period(device: torch.device) -> int:
     """Return after how many steps finished examples are dropped, for which a CPU waits."""
@@ -88,10 +91,7 @@ class Minimum(Rows, ShortRepr):
         # The cost is infinite, so that the first candidate of each example is recorded.
         nothing = {"success": zeros.bool(), "cost": torch.full_like(score.cost, torch.inf)}
         minimum = cls(
-            **evaluation.found | nothing,
-            steps=zeros,
-            queries=zeros,
-            backward_passes=zeros,
+            **evaluation.found | nothing | dict.fromkeys(COUNTS, zeros),
             success_before=score.is_success,
             cost_before=score.cost,
             zero_gradient=is_zero,
@@ -111,7 +111,7 @@ class Minimum(Rows, ShortRepr):
         Its steps and passes are added to the counts. Where it succeeds, its candidate replaces that
         of the example.
         """
-        for name in ("steps", "queries", "backward_passes"):
+        for name in COUNTS:
             getattr(self, name)[rows] += getattr(restart, name)
         self.record(rows, {name: getattr(restart, name) for name in FOUND}, restart.success)
 
