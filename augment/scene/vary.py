@@ -351,11 +351,8 @@ def _with_directional(environment: Float[Tensor, "E K 3"], directions: Tensor) -
 
     A surface that faces such a light has irradiance 1.
     """
-    is_directional = directions.any(1)
-    if not is_directional.any():
-        return environment
     added = directional(directions, torch.ones(3), degree_of(environment[0]))
-    mask = is_directional[:, None, None].to(environment.device)
+    mask = directions.any(1)[:, None, None].to(environment.device)
     return torch.where(mask, added.to(environment) + environment, environment)
 
 
