@@ -120,7 +120,6 @@ class OperatorRenderer:
         self._operators_per_stack = max(1, PIXELS_PER_STACK // self.settings.pixel_count)
         # Index of the stack of operators that renders each image, shape (N,).
         self._stack_of_image = self._operator_of_image // self._operators_per_stack
-        self._stack_count = math.ceil(len(self._views_of_operators) / self._operators_per_stack)
         # Stacks of transfer operators that were built so far, by their indices.
         self.built: dict[int, _BuiltStack] = {}
 
@@ -157,7 +156,7 @@ class OperatorRenderer:
                 # All other stacks must fit in memory, if each is as large as the first one.
                 tensors = (built.operators.transfer, built.operators.albedo, built.background_terms)
                 stack_bytes = sum(tensor.nbytes for tensor in tensors)
-                needed = (self._stack_count - 1) * stack_bytes + self.attack_bytes
+                needed = int(self._stack_of_image.max()) * stack_bytes + self.attack_bytes
                 height, width = self.settings.shape
                 count = len(self._views_of_operators)
                 name = f"{count} views of {height} × {width} pixels (views)"

@@ -508,8 +508,8 @@ class Scene:
         batch_images = torch.arange(len(light) * self.views, device=light.device)
         numbers = _on_cpu(examples).tolist()
         for rows, pixels, composite in self._render_with_operators(other_light, examples):
-            lamp_radiances = []
-            for image in batch_images[rows].tolist():
+            composites = []
+            for image, other in zip(batch_images[rows].tolist(), composite, strict=True):
                 # Image a · V + v is view v of row a.
                 row, view = divmod(image, self.views)
                 example = self.examples[numbers[row]]
@@ -519,9 +519,8 @@ class Scene:
                 radiance = local.radiance(lamps, albedo, light[row, lamp_rows], positions[row])
                 # Positions of the pixels that the object covers in the sorted list `pixels`.
                 covered = torch.searchsorted(pixels, fragments.pixels)
-                canvas = radiance.new_zeros(3, len(pixels))
-                lamp_radiances.append(canvas.index_copy(1, covered, radiance))
-            yield Layer(rows, pixels, composite + torch.stack(lamp_radiances))
+                composites.append(other.index_add(1, covered, radiance))
+            yield Layer(rows, pixels, torch.stack(composites))
 
     def _render_directly(
         self, conditions: Conditions, examples: Int[Tensor, " A"], is_draft: bool
