@@ -11,7 +11,7 @@ from torch import Tensor
 from augment.attack_settings import AttackSettings
 from augment.attacks.objective import Examples, Images, Values
 from augment.attacks.parameters import make_parameter
-from augment.attacks.parameters.lights import Lighting, Skylight, environment_light
+from augment.attacks.parameters.lights import Lighting, Skylight
 from augment.attacks.parameters.material import Material
 from augment.attacks.parameters.offsets import Albedo, Geometry, Pixels
 from augment.attacks.parameters.parameter import Parameter
@@ -159,7 +159,8 @@ def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) ->
     """
     if physical.lights is given.lights or torch.equal(physical.lights, given.lights):
         return
-    rows, basis = environment_light(given)
+    # The environment is the first light of a scene.
+    rows, basis = given.basis.lights[0]
     error = float(irradiance_error(physical.lights[:, rows], given.lights[:, rows]).max())
     if error > MAX_IRRADIANCE_ERROR:
         reason = "the light has negative radiance, and after its removal the irradiance is off by"
