@@ -59,8 +59,7 @@ class Pose(Parameter):
         if not scene.settings.silhouettes:
             advice = "set silhouettes=True, since an attack on the pose needs them"
             raise InputError(f"silhouettes=False: {advice}", "silhouettes")
-        self._object_of = scene.object_of
-        self._vertices = scene.vertices
+        self._scene = scene
         masks = [torch.from_numpy(item.own_vertices) for item in scene.objects]
         # Mask of the vertices of each object itself, without props and table, shape (objects, N).
         self._object_masks = pad_sequence(masks, batch_first=True).to(scene.lights.device)
@@ -96,11 +95,11 @@ class Pose(Parameter):
         The values are the pose divided by the units of the settings. Vertices that another
         parameter has displaced are moved, too.
         """
-        objects = self._object_of[examples]
+        objects = self._scene.object_of[examples]
         changes = values * self._unit
         vertices = conditions.vertices
         if vertices is None:
-            vertices = self._vertices[objects]
+            vertices = self._scene.vertices[objects]
         moved_vertices = [*map(self._moved, objects.tolist(), vertices, changes)]
         # `stack` refuses an empty list, as there is without examples.
         if moved_vertices:
