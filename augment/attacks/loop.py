@@ -105,16 +105,6 @@ class Minimum(Rows, ShortRepr):
             column = getattr(self, name)
             column[rows] = chosen(mask, candidates, column[rows])
 
-    def add_restart(self, rows: Int[Tensor, " N"], restart: Minimum) -> None:
-        """Add an attack on some examples from other initial values.
-
-        Its steps and passes are added to the counts. Where it succeeds, its candidate replaces that
-        of the example.
-        """
-        for name in COUNTS:
-            getattr(self, name)[rows] += getattr(restart, name)
-        self.record(rows, {name: getattr(restart, name) for name in FOUND}, restart.success)
-
 
 @torch.no_grad()
 def minimize(
@@ -200,7 +190,10 @@ def _minimize_group(
             break
         part = objective.select(rows)
         latest = minimize_from(restart[rows], optimizer, part, examples[rows])
-        result.add_restart(rows, latest)
+        for name in COUNTS:
+            getattr(result, name)[rows] += getattr(latest, name)
+        # Where the restart succeeds, its candidate replaces that of the example.
+        result.record(rows, {name: getattr(latest, name) for name in FOUND}, latest.success)
     return result
 
 
