@@ -85,9 +85,8 @@ class Drawn(NamedTuple):
             return surfaces.surface_of_depth(self.depth)
         nodes = self.heights().view(-1, 1, surfaces.SURFACE_NODES, surfaces.SURFACE_NODES)
         down, right = (surfaces.smooth(nodes, self.size, slope) for slope in "yx")
-        return surfaces.Surface(
-            down, right, (*surfaces.axes(self.size, nodes), surfaces.smooth(nodes, self.size))
-        )
+        position = (*surfaces.axes(self.size, nodes), surfaces.smooth(nodes, self.size))
+        return surfaces.Surface(down, right, position)
 
 
 class Illumination(NamedTuple):

@@ -572,8 +572,7 @@ def draw_lab_pattern(
 
     The image and the slides are linear RGB. "slides" chooses one of the slides.
     """
-    first = torch.from_numpy(draw_lab_color(rng))[:, None, None]
-    second = torch.from_numpy(draw_lab_color(rng))[:, None, None]
+    first, second = (torch.from_numpy(draw_lab_color(rng))[:, None, None] for _ in range(2))
     # The brightness is drawn even if it is not used, so that all patterns take the same
     # number of random draws.
     second = second * rng.uniform() * (name in TWO_COLORED)
