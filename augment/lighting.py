@@ -534,7 +534,7 @@ def _noisy_bytes(
 def relit_bytes(colors: UInt8[Tensor, "N C H W"], light: Illumination) -> UInt8[Tensor, "N C H W"]:
     """Multiply the linear colors of bytes by light, and return the nearest bytes."""
     decoded, carry = _tables(colors.device)
-    loop = loops.relit_bytes(colors, light.field)
+    loop = loops.relit_bytes(light.field)
     # The light is gain · field + offset. The loop takes these parts instead of their sum.
     if loop is None:
         albedo = decoded.index_select(0, colors.flatten().int()).view(colors.shape)

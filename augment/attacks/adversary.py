@@ -261,13 +261,11 @@ def save_lights(
     Local lights are the projector and the lamps. The suffix `when`, such as "_before", ends the
     name of each file. Return basis and coefficients of each light, the environment light first.
     """
-    lights: list[tuple[Any, Tensor]] = []
-    for rows, basis_of_light in basis.lights:
-        coefficients = light[rows]
+    lights: list[tuple[Any, Tensor]] = [(part.basis, light[part.rows]) for part in basis.lights]
+    for index, (basis_of_light, coefficients) in enumerate(lights):
         # The first light is the environment.
-        name = basis_of_light.name if lights else Path(LIGHT).stem
+        name = basis_of_light.name if index else Path(LIGHT).stem
         files.save_light(folder / f"{name}{when}.json", coefficients, basis_of_light)
-        lights.append((basis_of_light, coefficients))
     return lights
 
 

@@ -21,15 +21,15 @@ from torch import Tensor
 
 from augment.attack_settings import GRADIENT
 from augment.attacks.objective import NOISE_DRAWS, Examples, Images, Objective, Score, Values
-from augment.attacks.optimizers import KINDS, Evaluation, Optimizer, Problem, chosen
+from augment.attacks.optimizers import FOUND, KINDS, Evaluation, Optimizer, Problem, chosen
 from augment.network import frozen_eval_mode, say_once
 from augment.progress import progress
 from augment.scene.truth import Rows
 from renderer.errors import Check, ShortRepr, late_checks, raise_first
 from renderer.modes import without_autocast
 
-# Fields of a `Minimum` that belong to the returned candidate: the keys of `Evaluation.found`.
-FOUND = ("values", "images", "success", "cost", "predicted")
+# Fields that also count what restarts take.
+COUNTS = ("steps", "queries", "backward_passes")
 
 
 def drop_period(device: torch.device) -> int:
@@ -91,10 +91,7 @@ class Minimum(Rows, ShortRepr):
         # The cost is infinite, so that the first candidate of each example is recorded.
         nothing = {"success": zeros.bool(), "cost": torch.full_like(score.cost, torch.inf)}
         minimum = cls(
-            **evaluation.found | nothing,
-            steps=zeros,
-            queries=zeros,
-            backward_passes=zeros,
+            **evaluation.found | nothing | dict.fromkeys(COUNTS, zeros),
             success_before=score.is_success,
             cost_before=score.cost,
             zero_gradient=is_zero,
@@ -107,16 +104,6 @@ class Minimum(Rows, ShortRepr):
         for name, candidates in found.items():
             column = getattr(self, name)
             column[rows] = chosen(mask, candidates, column[rows])
-
-    def add_restart(self, rows: Int[Tensor, " N"], restart: Minimum) -> None:
-        """Add an attack on some examples from other initial values.
-
-        Its steps and passes are added to the counts. Where it succeeds, its candidate replaces that
-        of the example.
-        """
-        for name in ("steps", "queries", "backward_passes"):
-            getattr(self, name)[rows] += getattr(restart, name)
-        self.record(rows, {name: getattr(restart, name) for name in FOUND}, restart.success)
 
 
 @torch.no_grad()
@@ -203,7 +190,10 @@ def _minimize_group(
             break
         part = objective.select(rows)
         latest = minimize_from(restart[rows], optimizer, part, examples[rows])
-        result.add_restart(rows, latest)
+        for name in COUNTS:
+            getattr(result, name)[rows] += getattr(latest, name)
+        # Where the restart succeeds, its candidate replaces that of the example.
+        result.record(rows, {name: getattr(latest, name) for name in FOUND}, latest.success)
     return result
 
 

@@ -198,6 +198,10 @@ class NormBalls:
         return self.project(drawn, slice(None))
 
 
+# What is recorded of the best candidates: the fields of `Minimum` that belong to one candidate.
+FOUND = ("values", "images", "success", "cost", "predicted")
+
+
 @dataclass(frozen=True)
 class Evaluation:
     """Costs of P candidates of each of E examples, and the best candidate of each example.
@@ -223,13 +227,9 @@ class Evaluation:
     @property
     def found(self) -> dict[str, Tensor]:
         """Return what is recorded of the best candidates, by the names in `Minimum`."""
-        return {
-            "values": self.values,
-            "images": self.images,
-            "success": self.score.is_success,
-            "cost": self.score.cost,
-            "predicted": self.score.predicted,
-        }
+        score = self.score
+        parts = self.values, self.images, score.is_success, score.cost, score.predicted
+        return dict(zip(FOUND, parts, strict=True))
 
 
 class Optimizer(ABC):
@@ -240,6 +240,8 @@ class Optimizer(ABC):
 
     Attributes:
         uses_gradients: Whether `tell` needs the gradient of the cost.
+        candidate_count: Number P of candidates of each example that `ask` returns.
+        accepts_all: Whether candidates are accepted that do not lower the cost.
         values: Values of the accepted candidate of each example, shape (E, D).
         cost: Its cost, shape (E,).
         length: Length of the next change of each example, from 1 on, shape (E, 1).
@@ -247,6 +249,8 @@ class Optimizer(ABC):
     """
 
     uses_gradients: ClassVar[bool] = False
+    candidate_count: int = 1
+    accepts_all: bool = False
     length_factors: ClassVar[tuple[float, float]] = (1.0, 1.0)
 
     def __init__(self, problem: Problem, settings: AttackSettings, seed: int):
@@ -263,11 +267,6 @@ class Optimizer(ABC):
         self.cost = start.new_full((len(start),), torch.inf)
         self.length = start.new_ones(len(start), 1)
 
-    @property
-    def candidate_count(self) -> int:
-        """Number P of candidates of each example that `ask` returns."""
-        return 1
-
     @abstractmethod
     def ask(self, rows: Int[Tensor, " N"]) -> Float[Tensor, "N P D"]:
         """Return the candidates to evaluate next."""
@@ -277,14 +276,12 @@ class Optimizer(ABC):
 
         By default, the best candidate of an example is accepted if it lowers the cost.
         """
-        is_accepted = self._is_accepted(rows, evaluation.score.cost)
+        cost = evaluation.score.cost
+        is_accepted = (cost < self.cost[rows]) | self.accepts_all
         self.values[rows] = chosen(is_accepted, evaluation.values, self.values[rows])
-        self.cost[rows] = chosen(is_accepted, evaluation.score.cost, self.cost[rows])
+        self.cost[rows] = chosen(is_accepted, cost, self.cost[rows])
         self.length[rows] *= torch.where(is_accepted, *self.length_factors)[:, None]
         return is_accepted
-
-    def _is_accepted(self, rows: Int[Tensor, " N"], cost: Float[Tensor, " N"]) -> Tensor:
-        return cost < self.cost[rows]
 
 
 def chosen(mask: Bool[Tensor, " N"], new: Tensor, old: Tensor) -> Tensor:
@@ -305,6 +302,7 @@ class Gradient(Optimizer):
     def begin(self, examples: Examples, start: Values) -> None:
         """Begin with a gradient of zero."""
         super().begin(examples, start)
+        self.accepts_all = not self.settings.backtracking
         self.gradient = torch.zeros_like(start)
 
     def ask(self, rows: Int[Tensor, " N"]) -> Float[Tensor, "N 1 D"]:
@@ -319,10 +317,6 @@ class Gradient(Optimizer):
         if evaluation.gradient is not None:
             self.gradient[rows] = chosen(is_accepted, evaluation.gradient, self.gradient[rows])
         return is_accepted
-
-    def _is_accepted(self, rows: Int[Tensor, " N"], cost: Float[Tensor, " N"]) -> Tensor:
-        is_cheaper = super()._is_accepted(rows, cost)
-        return is_cheaper if self.settings.backtracking else torch.ones_like(is_cheaper)
 
 
 class RandomSearch(Optimizer):
@@ -369,16 +363,13 @@ class CMAES(Optimizer):
         The scale is 0 for values that have no effect.
         """
         super().begin(examples, start)
+        # The default of `cma` for D values.
+        self.candidate_count = 4 + int(3 * math.log(start.shape[1]))
         self._start = start
         self._scale = self.problem.search_scale(examples)
         self._strategies: dict[int, Any] = {}
         # The P points that each strategy drew last, shape (P, D), by the row of the example.
         self._drawn: dict[int, np.ndarray] = {}
-
-    @property
-    def candidate_count(self) -> int:
-        """Number of candidates: 4 + ⌊3 ln D⌋ for D values, the default of `cma`."""
-        return 4 + int(3 * math.log(self.values.shape[1]))
 
     def ask(self, rows: Int[Tensor, " N"]) -> Float[Tensor, "N P D"]:
         """Draw candidates of each example, and project them to the norm-balls."""

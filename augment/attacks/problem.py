@@ -11,7 +11,7 @@ from torch import Tensor
 from augment.attack_settings import AttackSettings
 from augment.attacks.objective import Examples, Images, Values
 from augment.attacks.parameters import make_parameter
-from augment.attacks.parameters.lights import Lighting, Skylight, environment_light
+from augment.attacks.parameters.lights import Lighting, Skylight
 from augment.attacks.parameters.material import Material
 from augment.attacks.parameters.offsets import Albedo, Geometry, Pixels
 from augment.attacks.parameters.parameter import Parameter
@@ -113,11 +113,10 @@ class SceneProblem:
         that are as long as those of an attack. `reached` are the values at the end of this attack.
         They are needed only if a parameter has no radius.
         """
-        samples = []
-        for parameter, part in self.split_by_parameter(self.start if reached is None else reached):
-            sample = parameter.sample(generator, None if reached is None else part)
-            samples.append(sample.to(self.start))
-        return torch.cat(samples, dim=1)
+        parts = self.split_by_parameter(self.start if reached is None else reached)
+        given = [(each, None if reached is None else part) for each, part in parts]
+        samples = [parameter.sample(generator, part) for parameter, part in given]
+        return torch.cat(samples, dim=1).to(self.start)
 
     def split_by_parameter(self, values: Values) -> list[tuple[Parameter, Tensor]]:
         """Split the attack values of examples into the values of each parameter."""
@@ -160,7 +159,8 @@ def warn_of_changed_light(given: Scene, physical: Scene, stacklevel: int = 3) ->
     """
     if physical.lights is given.lights or torch.equal(physical.lights, given.lights):
         return
-    rows, basis = environment_light(given)
+    # The environment is the first light of a scene.
+    rows, basis = given.basis.lights[0]
     error = float(irradiance_error(physical.lights[:, rows], given.lights[:, rows]).max())
     if error > MAX_IRRADIANCE_ERROR:
         reason = "the light has negative radiance, and after its removal the irradiance is off by"

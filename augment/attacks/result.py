@@ -336,15 +336,13 @@ class AttackResult(ShortRepr):
         start = self.problem.start
         change = self.minimum.values.to(start) - start
         examples = self.problem.all_examples[[example]]
+        # The first and the last frame are the images of the result itself.
+        ends = {0: self.images_in_views_before, frame_count - 1: self.images_in_views}
         images, evidence, balls = [], [], []
         for index in range(frame_count):
             values = start + index / (frame_count - 1) * change
-            rendered = self.problem.images(values, examples)
-            # The first and the last frame are the images of the result itself.
-            if index == 0:
-                rendered = self.images_in_views_before[examples]
-            elif index == frame_count - 1:
-                rendered = self.images_in_views[examples]
+            is_end = index in ends
+            rendered = ends[index][examples] if is_end else self.problem.images(values, examples)
             images.append(self.drawn(rendered[0, view]))
             objective = self.objective().select(examples)
             objective = objective.moved(self.problem, values[examples], examples)

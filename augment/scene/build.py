@@ -150,7 +150,6 @@ def build_scene(
     renderer_settings = replace(renderer or RendererSettings(), **renderer_options)
     objects = _load_objects(meshes, settings, renderer_settings.encoding)
     environment: Any = settings.light
-    degree = None
     # Loads the lighting again with a higher degree, which a smoother surface may need later. It
     # stays None if the user gave coefficients or chose the degree.
     lights_of_degree = None
@@ -163,13 +162,13 @@ def build_scene(
         environment = load_light(environment, degree, smoothest.gloss_roughness)
         _warn_of_wrong_irradiance(settings.light, environment, degree)
         if settings.degree is None:
-            lights_of_degree = partial(_build_lights, settings, settings.light)
+            lights_of_degree = partial(_lights_of_degree, settings)
     else:
         environment = errors.as_tensor("light", environment)
         # `degree_of` raises InputError if the shape is not that of coefficients.
         harmonics.degree_of(environment)
         errors.require_bounded(light=environment)
-    basis, lights = _build_lights(settings, environment, degree)
+    basis, lights = _build_lights(settings, environment)
     rasterizer = renderer_settings.rasterizer
     orbit = settings.width, settings.polar, settings.azimuth, settings.fov
     built = Scene.grid(
@@ -249,19 +248,18 @@ def _as_cameras(cameras: object, views: int, normalize: bool) -> list[Camera]:
     return [camera.normalized(np.zeros(3), 1.0) for camera in fixed] if normalize else fixed
 
 
-def _build_lights(
-    settings: SceneSettings,
-    environment: Tensor | str | Path,
-    degree: int | None,
-    roughness: float | None = None,
+def _lights_of_degree(
+    settings: SceneSettings, degree: int, roughness: float | None
 ) -> tuple[Basis, Tensor]:
+    """Load the lights with another degree, for a roughness that is None without gloss."""
+    return _build_lights(settings, load_light(settings.light, degree, roughness))
+
+
+def _build_lights(settings: SceneSettings, environment: Tensor) -> tuple[Basis, Tensor]:
     """Join the environment lighting with the projector and the lamps of the settings.
 
-    A named lighting is loaded with the degree, for a roughness that is None without gloss. Return
-    the basis of all lights and their RGB coefficients.
+    Return the basis of all lights and their RGB coefficients.
     """
-    if isinstance(environment, str | Path):
-        environment = load_light(environment, degree, roughness)
     given = [getattr(settings, name) for name in LOCAL_LIGHTS]
     local = [build_local_light(light) for light in given if light is not None]
     return with_local_lights(environment * settings.given_exposure, local)
@@ -476,14 +474,12 @@ def expose(scene: Scene) -> Scene:
     for index, item in enumerate(scene.objects):
         rows = [row for row, example in enumerate(scene.examples) if example.object == index]
         # At most `PROBED` examples at equal distances. -(-a // b) divides and rounds up.
-        values, local = torch.empty(0), torch.zeros(1)
-        if rows:
-            probe = _probe(scene, rows[:: -(-len(rows) // PROBED)])
-            # Light of projector and lamps, which the exposure leaves as it is.
-            local = _linear_values(probe, 0.0) if scene.basis.local_lights else local
-            values = _linear_values(probe, 1.0) - local
+        probe = _probe(scene, rows[:: -(-len(rows) // PROBED)])
+        # Light of projector and lamps, which the exposure leaves as it is.
+        local = _linear_values(probe, 0.0) if scene.basis.local_lights else torch.zeros(1)
+        values = _linear_values(probe, 1.0) - local
         # Fraction of the values that are not 0, which alone can grow with the exposure.
-        lit = float((values > 0).float().mean()) if rows else 0.0
+        lit = float((values > 0).float().mean())
         aim = min(MEAN, LIT_MEAN * lit)
         low, high = -float(STOPS), float(STOPS)
         # The mean grows with the exposure. 40 halvings leave 2^-35 stops.
@@ -495,12 +491,11 @@ def expose(scene: Scene) -> Scene:
         local_mean = encode(clamp(local), scene.settings.encoding).mean()
         is_above = lit > 0 and float(local_mean) >= aim
         factors.append(2**low if lit and not is_above else 1.0)
-        if rows:
-            mean = encode(clamp(values * factors[-1] + local), scene.settings.encoding).mean()
-            said = f"{item.name}: exposure={factors[-1]:.3g}, at which its mean is {mean:.2g}"
-            if is_above:
-                said += f", because projector and lamps alone exceed {aim:.2g}: lower their power"
-            say_once(said)
+        mean = encode(clamp(values * factors[-1] + local), scene.settings.encoding).mean()
+        said = f"{item.name}: exposure={factors[-1]:.3g}, at which its mean is {mean:.2g}"
+        if is_above:
+            said += f", because projector and lamps alone exceed {aim:.2g}: lower their power"
+        say_once(said)
     examples = [
         replace(example, exposure=example.exposure * factors[example.object])
         for example in scene.examples

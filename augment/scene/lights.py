@@ -26,7 +26,7 @@ from torch import Tensor
 
 from augment.scene import loops, patterns, surfaces
 from augment.scene.surfaces import Range, limits
-from renderer.errors import InputError, as_list, require_choice, require_number
+from renderer.errors import as_list, require_choice, require_number
 from renderer.image import straight_through
 from renderer.settings import Size, height_and_width
 
@@ -85,9 +85,8 @@ class Drawn(NamedTuple):
             return surfaces.surface_of_depth(self.depth)
         nodes = self.heights().view(-1, 1, surfaces.SURFACE_NODES, surfaces.SURFACE_NODES)
         down, right = (surfaces.smooth(nodes, self.size, slope) for slope in "yx")
-        return surfaces.Surface(
-            down, right, (*surfaces.axes(self.size, nodes), surfaces.smooth(nodes, self.size))
-        )
+        position = (*surfaces.axes(self.size, nodes), surfaces.smooth(nodes, self.size))
+        return surfaces.Surface(down, right, position)
 
 
 class Illumination(NamedTuple):
@@ -359,8 +358,6 @@ class CastShadow(LightModel):
         for kind in as_list("kinds", self.kinds, str, "a list of names"):
             require_choice("kinds", kind, SHADOWS)
         object.__setattr__(self, "kinds", tuple(self.kinds))
-        if not self.kinds:
-            raise InputError("kinds is empty: name at least one kind of shadow")
 
     def light(self, drawn: Drawn) -> Illumination:
         """Compute the light of the sun and of the sky."""

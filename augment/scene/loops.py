@@ -58,13 +58,10 @@ def _loop(
                 settings.LOOP_VECTORIZE = vectorize
             return lambda *values: loop(*map(_as_array, values))
 
-        # The loop if it takes such tensors, or None.
-        def fitting(*tensors: Tensor) -> Callable[..., None] | None:
-            for values in tensors:
-                is_other = values.requires_grad or values.dtype == torch.float64
-                if is_other or values.device.type != "cpu":
-                    return None
-            return compiled()
+        # The loop if it takes such a tensor, or None.
+        def fitting(values: Tensor) -> Callable[..., None] | None:
+            is_other = values.requires_grad or values.dtype == torch.float64
+            return None if is_other or values.device.type != "cpu" else compiled()
 
         return fitting
 

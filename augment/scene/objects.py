@@ -428,6 +428,4 @@ class Conditions(ShortRepr):
         rows = {name: field[index] for name, field in vars(self).items() if field is not None}
         # Only these fields are padded to the size of the largest mesh.
         counts = {"vertices": len(mesh.vertices)} | dict.fromkeys(OF_FACES, len(mesh.faces))
-        for name in rows.keys() & counts:
-            rows[name] = rows[name][: counts[name]]
-        return Conditions(**rows)
+        return Conditions(**{name: row[: counts.get(name)] for name, row in rows.items()})

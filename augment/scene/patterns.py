@@ -21,7 +21,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Generator, Tensor
 
-from augment.scene.surfaces import draw_shading, smooth
+from augment.scene.surfaces import between, draw_shading, smooth
 from renderer.errors import InputError, require_kind
 from renderer.image import LUMINANCE, clamp, decode, encode, to_unit
 from renderer.settings import Size, height_and_width
@@ -195,7 +195,7 @@ def draw_patterns(
     # Four numbers in [0, 1] of each pattern, each of shape (count, 1, 1): angle as a fraction of
     # a full turn, period as a fraction of its range, and shifts along x and y.
     turn, relative_period, *shifts = positions.T[:, :, None, None]
-    period = MIN_PERIOD + (MAX_PERIOD - MIN_PERIOD) * relative_period
+    period = between(relative_period, MIN_PERIOD, MAX_PERIOD)
     angle = 2 * math.pi * turn
     # Points of the pattern in units of its period, shape (2, count, height, width).
     rotated = turned((x / period, y / period), angle.cos(), angle.sin())
@@ -280,8 +280,7 @@ def draw_slides(
     A slide has a two-color pattern, Voronoi cells, a smooth field or a photograph. Slides are
     linear light on the CPU.
     """
-    families: list[Callable[[int, Size, Generator], Tensor]]
-    families = [draw_patterns, draw_cells, draw_fields]
+    families: list[Callable[..., Tensor]] = [draw_patterns, draw_cells, draw_fields]
     if photographs is not None:
         families.append(partial(draw_projected, photographs))
     # `multinomial` divides by the sum, so the probabilities fit without photographs, too.
@@ -422,8 +421,7 @@ def draw_projected_light(
     shading = draw_shading(count, size, draws)
     # Fractions in [0, 1] of the ranges of the ambient light and of the exposure.
     ambient, stops = torch.rand(2, count, 1, 1, 1, generator=draws)
-    ambient = AMBIENT[0] + (AMBIENT[1] - AMBIENT[0]) * ambient
-    return ProjectedLight(slide, shading, ambient, STOPS[0] + (STOPS[1] - STOPS[0]) * stops)
+    return ProjectedLight(slide, shading, between(ambient, *AMBIENT), between(stops, *STOPS))
 
 
 # Pictures of the projectors of pnb-lab. The object in the center of a picture spans about
@@ -574,8 +572,7 @@ def draw_lab_pattern(
 
     The image and the slides are linear RGB. "slides" chooses one of the slides.
     """
-    first = torch.from_numpy(draw_lab_color(rng))[:, None, None]
-    second = torch.from_numpy(draw_lab_color(rng))[:, None, None]
+    first, second = (torch.from_numpy(draw_lab_color(rng))[:, None, None] for _ in range(2))
     # The brightness is drawn even if it is not used, so that all patterns take the same
     # number of random draws.
     second = second * rng.uniform() * (name in TWO_COLORED)

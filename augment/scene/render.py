@@ -120,7 +120,6 @@ class OperatorRenderer:
         self._operators_per_stack = max(1, PIXELS_PER_STACK // self.settings.pixel_count)
         # Index of the stack of operators that renders each image, shape (N,).
         self._stack_of_image = self._operator_of_image // self._operators_per_stack
-        self._stack_count = math.ceil(len(self._views_of_operators) / self._operators_per_stack)
         # Stacks of transfer operators that were built so far, by their indices.
         self.built: dict[int, _BuiltStack] = {}
 
@@ -157,7 +156,7 @@ class OperatorRenderer:
                 # All other stacks must fit in memory, if each is as large as the first one.
                 tensors = (built.operators.transfer, built.operators.albedo, built.background_terms)
                 stack_bytes = sum(tensor.nbytes for tensor in tensors)
-                needed = (self._stack_count - 1) * stack_bytes + self.attack_bytes
+                needed = int(self._stack_of_image.max()) * stack_bytes + self.attack_bytes
                 height, width = self.settings.shape
                 count = len(self._views_of_operators)
                 name = f"{count} views of {height} × {width} pixels (views)"
@@ -215,7 +214,8 @@ class Group(NamedTuple):
         views: Number of each view among those of its example.
         object: Index of the object.
         cameras: Camera of each view.
-        changed: Conditions of the first row, which differ from the others in the light only.
+        changed: Conditions of the rows, which differ in the light only. If there are several rows,
+            each view has a light, shape (N, K, 3).
     """
 
     rows: tuple[int, ...]
@@ -333,12 +333,12 @@ class DirectRenderer:
         self._views: dict[tuple[int, tuple[Camera, ...]], tuple[Fragments, Tensor]] = {}
         # Views of unmoved objects that were prepared for the light of projector and lamps.
         self._local_views: dict[tuple[int, Camera], LocalLightView] = {}
-        # Ray tracers, and shadows and bounces, of unmoved objects by their indices.
+        # Ray tracers of unmoved objects by their indices.
         self._rays = [Rays(item.mesh) for item in self.objects]
-        self._transport_of_object: dict[int, FrozenTransport] = {}
-        # Shadows and bounces of moved shapes, by the indices of their examples and objects. Scenes
-        # with other examples of the same objects may share this renderer.
-        self._transport_of_example: dict[tuple[int, int], FrozenTransport] = {}
+        # Shadows and bounces: of unmoved objects by their indices, and of moved shapes by those of
+        # their examples and objects. Scenes with other examples of the same objects may share this
+        # renderer.
+        self._transports: dict[int | tuple[int, int], FrozenTransport] = {}
 
     @cached_property
     def vertices(self) -> list[Tensor]:
@@ -436,13 +436,9 @@ class DirectRenderer:
 
     def _seen(self, group: Group) -> tuple[Mesh, Fragments, tuple[Camera, ...]]:
         """Return the mesh of a group, what its cameras see, and the cameras as numbers."""
-        vertices = group.changed.vertices
-        mesh = _moved(self.objects[group.object].mesh, vertices)
-        cameras = tuple(camera.fixed() for camera in group.cameras)
-        if vertices is None:
-            return mesh, self.view(group.object, *cameras)[0], cameras
-        fragments, _ = self._rasterize(group.object, cameras, vertices, self.settings)
-        return mesh, fragments, cameras
+        mesh = _moved(self.objects[group.object].mesh, group.changed.vertices)
+        fragments, _ = self._rasterized(group, self.settings)
+        return mesh, fragments, tuple(camera.fixed() for camera in group.cameras)
 
     def views_at_once(self) -> int:
         """Return how many views `radiance` renders at once. Rays and silhouettes need one."""
@@ -452,12 +448,7 @@ class DirectRenderer:
         return views_at_once(self.settings, self.like, casts_rays)
 
     def radiance(
-        self,
-        example: int,
-        group: Group,
-        light: Float[Tensor, "*views K 3"],
-        background: Float[Tensor, "_ pixels"],
-        is_draft: bool = False,
+        self, example: int, group: Group, background: Float[Tensor, "_ pixels"], is_draft: bool
     ) -> PixelRadiance:
         """Render `views_at_once` views of an object with changed shape, colors, gloss or lamps.
 
@@ -477,10 +468,7 @@ class DirectRenderer:
         settings = self.settings
         if has_draft:
             settings = replace(settings, samples=min(settings.samples, DRAFT_SAMPLES))
-        if moved is None:
-            rasterized = self.view(object_index, *fixed_cameras)
-        else:
-            rasterized = self._rasterize(object_index, fixed_cameras, moved, settings)
+        rasterized = self._rasterized(group, settings)
         fragments, albedo = rasterized
         if changed.albedo is not None:
             of_view = (item.mesh, fragments, settings.encoding, item.albedo_scale)
@@ -488,7 +476,7 @@ class DirectRenderer:
         gloss = None
         if changed.gloss is not None:
             gloss = Gloss(*changed.gloss.unbind(1), textured=True)
-        split = split_light(self.basis, light)
+        split = split_light(self.basis, changed.light)
         # Projector and lamps need rays for their shadows. For an unmoved object with its own
         # gloss, the view is prepared once.
         lamp_view = None
@@ -544,16 +532,23 @@ class DirectRenderer:
         def trace(mesh: Mesh) -> FrozenTransport:
             return FrozenTransport(mesh, self.settings, item.albedo_scale, self.basis)
 
+        kept = self._transports
         # The light paths of the unmoved mesh are traced once.
-        frozen = self._transport_of_object.get(object_index) or trace(item.mesh)
-        self._transport_of_object[object_index] = frozen
-        if not frozen.is_near(positions):
-            key = (example, object_index)
-            frozen = self._transport_of_example.get(key, frozen)
-            if not frozen.is_near(positions):
-                frozen = trace(replace(item.mesh, vertices=positions))
-            self._transport_of_example[key] = frozen
-        return frozen
+        if object_index not in kept:
+            kept[object_index] = trace(item.mesh)
+        if kept[object_index].is_near(positions):
+            return kept[object_index]
+        key = (example, object_index)
+        if key not in kept or not kept[key].is_near(positions):
+            kept[key] = trace(replace(item.mesh, vertices=positions))
+        return kept[key]
+
+    def _rasterized(self, group: Group, settings: ImageSettings) -> tuple[Fragments, Tensor]:
+        """Find the samples that the cameras of a group see, and their albedo (S, 3)."""
+        cameras = tuple(camera.fixed() for camera in group.cameras)
+        if group.changed.vertices is None:
+            return self.view(group.object, *cameras)
+        return self._rasterize(group.object, cameras, group.changed.vertices, settings)
 
     def _rasterize(
         self,

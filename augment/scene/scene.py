@@ -137,9 +137,8 @@ class Scene:
         self.attack_bytes = self._count_attack_bytes()
         # Images are numbered by example and then by view: e · V + v.
         built_with: dict[str, Any] = {"rasterizer": rasterizer, "basis": basis}
-        if device.type == "cuda":
-            # On other devices, operators are computed on the CPU, and their stacks are moved.
-            built_with["device"] = device
+        # On devices other than CUDA, operators are computed on the CPU, and their stacks are moved.
+        built_with["device"] = device if device.type == "cuda" else "cpu"
         self._operator_renderer = OperatorRenderer(
             self.objects,
             [(item.object, camera) for item in self.examples for camera in item.cameras],
@@ -509,8 +508,8 @@ class Scene:
         batch_images = torch.arange(len(light) * self.views, device=light.device)
         numbers = _on_cpu(examples).tolist()
         for rows, pixels, composite in self._render_with_operators(other_light, examples):
-            lamp_radiances = []
-            for image in batch_images[rows].tolist():
+            composites = []
+            for image, other in zip(batch_images[rows].tolist(), composite, strict=True):
                 # Image a · V + v is view v of row a.
                 row, view = divmod(image, self.views)
                 example = self.examples[numbers[row]]
@@ -520,9 +519,8 @@ class Scene:
                 radiance = local.radiance(lamps, albedo, light[row, lamp_rows], positions[row])
                 # Positions of the pixels that the object covers in the sorted list `pixels`.
                 covered = torch.searchsorted(pixels, fragments.pixels)
-                canvas = radiance.new_zeros(3, len(pixels))
-                lamp_radiances.append(canvas.index_copy(1, covered, radiance))
-            yield Layer(rows, pixels, composite + torch.stack(lamp_radiances))
+                composites.append(other.index_add(1, covered, radiance))
+            yield Layer(rows, pixels, torch.stack(composites))
 
     def _render_directly(
         self, conditions: Conditions, examples: Int[Tensor, " A"], is_draft: bool
@@ -538,13 +536,9 @@ class Scene:
             groups = progress(list(groups), "rendering views")
         for group in groups:
             rows = group.rows
-            numbers_behind = [self.examples[numbers[row]].background for row in rows]
-            behind = torch.cat([self.backgrounds[each] for each in numbers_behind], dim=1)
-            background = behind.flatten(1)
-            light = group.changed.light
-            if rows[0] != rows[-1]:
-                light = torch.stack([conditions.light[row] for row in rows])
-            shown = numbers[rows[0]], group, light, background, is_draft
+            behind = self.backgrounds[[self.examples[numbers[row]].background for row in rows]]
+            background = behind.transpose(0, 1).flatten(1)
+            shown = numbers[rows[0]], group, background, is_draft
             pixels, coverage, radiance = self._direct_renderer.radiance(*shown)
             # Pixels at the border of the object show a part of the background.
             seen_background = background.index_select(1, pixels)
@@ -576,6 +570,9 @@ class Scene:
             while group := list(islice(of_mesh, at_once)):
                 rows, views = zip(*group, strict=True)
                 changed = conditions.row(rows[0], self.objects[index].mesh)
+                if rows[0] != rows[-1]:
+                    light = torch.stack([conditions.light[row] for row in rows])
+                    changed = replace(changed, light=light)
                 of_views = tuple(cameras[row][view] for row, view in group)
                 yield Group(rows, views, index, of_views, changed)
 

@@ -94,11 +94,16 @@ def spline(
     # Column i of the matrix is the interpolation of nodes that are 1 at node i and 0 elsewhere.
     values = F.interpolate(identity, (pixels, 1), mode=mode, align_corners=corners)
     matrix = values[0, :, :, 0].T
-    if spacing and pixels == 1:
-        matrix = torch.zeros_like(matrix)
-    elif spacing:
-        (matrix,) = torch.gradient(matrix, spacing=spacing, dim=0)
+    if spacing:
+        matrix = _slope(matrix, spacing, 0)
     return matrix.to(device, dtype).contiguous()
+
+
+def _slope(values: Tensor, spacing: float, axis: int) -> Tensor:
+    """Return the gradient of values along an axis. It is 0 along an axis of one value."""
+    if values.shape[axis] == 1:
+        return torch.zeros_like(values)
+    return torch.gradient(values, spacing=spacing, dim=axis)[0]
 
 
 @lru_cache(maxsize=64)
@@ -169,12 +174,7 @@ def surface_of_depth(depth: Float[Tensor, "B 1 H W"]) -> Surface:
     x, y = axes(depth.shape[-2:], depth)
     # Slopes of the logarithm of the depth along the pixels, where half the width is the tangent.
     spacing = 2 * tangent / depth.shape[-1]
-    down, right = (
-        torch.gradient(relative.log(), spacing=spacing, dim=axis)[0]
-        if depth.shape[axis] > 1
-        else torch.zeros_like(depth)
-        for axis in (2, 3)
-    )
+    down, right = (_slope(relative.log(), spacing, axis) for axis in (2, 3))
     # Product of both tangents of the surface z · (x, y, 1), up to a factor.
     towards = 1 + tangent * (x * right + y * down)
     towards = towards.clamp(min=0.05)

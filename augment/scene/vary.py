@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -17,6 +17,7 @@ from augment.progress import progress
 from augment.scene import patterns
 from augment.scene.objects import Example, SceneObject, resample_instance, rotated, with_own_mesh
 from augment.scene.scene import Scene
+from augment.scene.surfaces import between
 from augment.scene.tabletop import Room, above_table, irradiance, project_along_light
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError
@@ -203,9 +204,8 @@ class _Variation:
             environment = torch.stack(loaded)[chosen].to(scene.lights)
         if not settings.directional_fraction:
             return environment, torch.zeros(count, 3, dtype=torch.float64)
-        low, high = settings.fill_light
         # Factor by which the environment of an example with a directional light is dimmed.
-        fill = low + (high - low) * torch.rand(count, 1, 1, generator=self.draws)
+        fill = between(torch.rand(count, 1, 1, generator=self.draws), *settings.fill_light)
         is_chosen = torch.rand(count, 1, 1, generator=self.draws) < settings.directional_fraction
         turns = zip(scene.cameras, self._draw_pairs(MAX_LIGHT_ANGLE), strict=True)
         directions = _towards_cameras([_turn(cameras[0], *turn) for cameras, turn in turns])
@@ -296,7 +296,7 @@ class _Variation:
     def _draw_uniform(self, low: float, high: float) -> Float[Tensor, " E"]:
         """Draw a uniformly distributed number for each example."""
         fractions = torch.rand(len(self.scene), generator=self.draws, dtype=torch.float64)
-        return low + (high - low) * fractions
+        return between(fractions, low, high)
 
     def _draw_pairs(self, limit: float) -> list[list[float]]:
         """Draw a pair of numbers for each example uniformly from [-limit, limit]."""
@@ -338,14 +338,12 @@ def _move(
         # The polar angle is measured from the vertical, so its cosine is the sine of the elevation.
         elevation = abs(math.degrees(math.asin(math.cos(math.radians(moved.polar)))))
         moved = replace(moved, polar=90 - min(max(elevation, MIN_ELEVATION), MAX_ELEVATION))
-    if fov:
-        distance = width / 2 / math.tan(math.radians(fov) / 2)
-        # An orthographic camera becomes a perspective camera with the same fields.
-        if isinstance(moved, PerspectiveCamera):
-            return replace(moved, distance=distance)
-        fields_of_camera = {item.name: getattr(moved, item.name) for item in fields(Camera)}
-        return PerspectiveCamera(**fields_of_camera, distance=distance)
-    return moved
+    if not fov:
+        return moved
+    distance = width / 2 / math.tan(math.radians(fov) / 2)
+    # An orthographic camera becomes a perspective camera with the same fields.
+    kind = type(moved) if isinstance(moved, PerspectiveCamera) else PerspectiveCamera
+    return kind(**vars(moved) | {"distance": distance})
 
 
 def _with_directional(environment: Float[Tensor, "E K 3"], directions: Tensor) -> Tensor:
@@ -353,11 +351,8 @@ def _with_directional(environment: Float[Tensor, "E K 3"], directions: Tensor) -
 
     A surface that faces such a light has irradiance 1.
     """
-    is_directional = directions.any(1)
-    if not is_directional.any():
-        return environment
     added = directional(directions, torch.ones(3), degree_of(environment[0]))
-    mask = is_directional[:, None, None].to(environment.device)
+    mask = directions.any(1)[:, None, None].to(environment.device)
     return torch.where(mask, added.to(environment) + environment, environment)
 
 
@@ -400,9 +395,8 @@ def draw_camera_effects(
             shown = patterns.pixel_centers(size) if points is None else points[:, is_photograph]
             slides = patterns.draw_photograph_patterns(decode(files, "srgb"), shown, draws)
             light[is_photograph] = slides
-    low, high = settings.pattern_fill
     # Fraction of the light of each example that does not come from the projector.
-    fill = low + (high - low) * torch.rand(count, 1, 1, 1, generator=draws)
+    fill = between(torch.rand(count, 1, 1, 1, generator=draws), *settings.pattern_fill)
     # Some examples have no pattern.
     has_pattern = torch.rand(count, 1, 1, 1, generator=draws) < settings.pattern_fraction
     pattern_gains = torch.where(has_pattern, fill + (1 - fill) * light, 1.0)

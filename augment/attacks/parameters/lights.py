@@ -58,12 +58,6 @@ class LightParameter(Parameter):
         return self._basis.nearest_nonnegative(coefficients, ball).flatten(1)
 
 
-def environment_light(scene: Scene) -> Part:
-    """Return the rows of the environment lighting among all lights of a scene, and its basis."""
-    # The environment is the first light of a scene.
-    return scene.basis.lights[0]
-
-
 def replace_light(
     conditions: Conditions, rows: slice, coefficients: Float[Tensor, "E K 3"]
 ) -> Conditions:
@@ -92,7 +86,8 @@ class Lighting(LightParameter):
     name = "lighting"
 
     def __init__(self, scene: Scene, settings: StepSettings, nonnegative: bool = False):
-        super().__init__(scene, settings, environment_light(scene), nonnegative)
+        # The environment is the first light of a scene.
+        super().__init__(scene, settings, scene.basis.lights[0], nonnegative)
 
 
 class LocalLight(LightParameter):
@@ -140,7 +135,8 @@ class Skylight(Parameter):
 
     def __init__(self, scene: Scene, settings: SkylightSettings, nonnegative: bool = False):
         """Compute the initial sky and its brightness."""
-        self._rows, self._basis = environment_light(scene)
+        # The environment, which is the first light of a scene.
+        self._rows, self._basis = scene.basis.lights[0]
         initial_sky = sky_coefficients(settings.zenith, settings.azimuth, settings.turbidity)
         sky_luminance = mean_luminance(initial_sky)
         replaced_lights = scene.lights[:, self._rows]
@@ -149,8 +145,7 @@ class Skylight(Parameter):
         self._scale = torch.tensor(scales, dtype=torch.float64, device=scene.lights.device)
 
         self._window = nonnegative_window(HARMONICS.degree) if nonnegative else None
-        self._sun = settings.sun
-        self._units = self._sun, self._sun, TURBIDITY_UNIT
+        self._units = settings.sun, settings.sun, TURBIDITY_UNIT
         units = torch.tensor(self._units, dtype=torch.float64)
         initial = units.new_tensor([getattr(settings, name) for name in SKY])
         start = (initial / units).to(scene.lights)
@@ -165,7 +160,7 @@ class Skylight(Parameter):
         The values are zenith angle, azimuth and turbidity, each divided by its unit.
         """
         # Convert the angles to degrees in float64, so that rounding is negligible.
-        zenith, azimuth = (values[:, :2].double() * self._sun).unbind(1)
+        zenith, azimuth = (values[:, :2].double() * self._units[0]).unbind(1)
         turbidity = values[:, 2] * TURBIDITY_UNIT
         sky = sky_coefficients(zenith, azimuth, turbidity)
         sky = sky * self._scale[examples, None, None]

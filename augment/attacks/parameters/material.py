@@ -48,9 +48,25 @@ class Material(Parameter):
     fits_other_meshes = False
 
     def __init__(self, scene: Scene, settings: MaterialSettings):
-        """Read the units, and the materials at which the attack starts."""
+        """Read the materials at which the attack starts, and the units."""
         self._object_of = scene.object_of
-        self._read_materials(scene)
+        self._face_count = max(len(item.mesh.faces) for item in scene.objects)
+        glosses = [initial_materials(item) for item in scene.objects]
+        # Masks of the faces of each object itself, without props and table.
+        masks = [torch.from_numpy(item.own_faces) for item in scene.objects]
+        pairs = [*zip(glosses, masks, strict=True)]
+        averages = [gloss[mask].mean(0) for gloss, mask in pairs]
+        # Average roughness, metallic and specular factor of each object, shape (objects, 3).
+        self._average_gloss = torch.stack(averages).to(scene.lights)
+        # Save memory: of faces that are alike, keep one only.
+        are_alike = all(mask.all() and (gloss == gloss[0]).all() for gloss, mask in pairs)
+        kept = slice(1 if are_alike else None)
+        # F is the number of faces of the largest mesh, or 1 if the faces of each object are
+        # alike. The shapes are (objects, F, 3) and (objects, F).
+        face_gloss = pad_sequence([gloss[kept] for gloss in glosses], batch_first=True)
+        object_mask = pad_sequence([mask[kept] for mask in masks], batch_first=True)
+        self._face_gloss = face_gloss.to(scene.lights)
+        self._object_mask = object_mask.to(scene.lights)
 
         gloss_units = [settings.roughness, settings.metallic, settings.specular_factor]
         units = torch.tensor([*gloss_units, settings.hue]).to(scene.lights)
@@ -73,26 +89,6 @@ class Material(Parameter):
         # The metallic factor of an object is attacked only if the object is metallic.
         used_mask[:, METALLIC] &= self._average_gloss[:, METALLIC] > 0
         super().__init__(settings, start[scene.object_of], used_mask[scene.object_of])
-
-    def _read_materials(self, scene: Scene) -> None:
-        """Keep the materials of the objects of a scene before the attack."""
-        self._face_count = max(len(item.mesh.faces) for item in scene.objects)
-        glosses = [initial_materials(item) for item in scene.objects]
-        # Masks of the faces of each object itself, without props and table.
-        masks = [torch.from_numpy(item.own_faces) for item in scene.objects]
-        pairs = [*zip(glosses, masks, strict=True)]
-        averages = [gloss[mask].mean(0) for gloss, mask in pairs]
-        # Average roughness, metallic and specular factor of each object, shape (objects, 3).
-        self._average_gloss = torch.stack(averages).to(scene.lights)
-        # Save memory: of faces that are alike, keep one only.
-        are_alike = all(mask.all() and (gloss == gloss[0]).all() for gloss, mask in pairs)
-        kept = slice(1 if are_alike else None)
-        # F is the number of faces of the largest mesh, or 1 if the faces of each object are
-        # alike. The shapes are (objects, F, 3) and (objects, F).
-        face_gloss = pad_sequence([gloss[kept] for gloss in glosses], batch_first=True)
-        object_mask = pad_sequence([mask[kept] for mask in masks], batch_first=True)
-        self._face_gloss = face_gloss.to(scene.lights)
-        self._object_mask = object_mask.to(scene.lights)
 
     def apply(self, values: Values, conditions: Conditions, examples: Examples) -> Conditions:
         """Return a copy of the conditions with the given gloss and hue of the objects.

@@ -73,8 +73,7 @@ class Geometry(MeshParameter):
     name = "geometry"
 
     def __init__(self, scene: Scene, settings: StepSettings):
-        self._vertices = scene.vertices
-        self._object_of = scene.object_of
+        self._scene = scene
         super().__init__(scene, settings, [item.own_vertices for item in scene.objects])
 
     def apply(self, values: Values, conditions: Conditions, examples: Examples) -> Conditions:
@@ -83,7 +82,7 @@ class Geometry(MeshParameter):
         The values are displacements of the N vertices of the largest mesh in world units.
         """
         # Vertices before the attack, shape (E, N, 3).
-        vertices = self._vertices[self._object_of[examples]]
+        vertices = self._scene.vertices[self._scene.object_of[examples]]
         return replace(conditions, vertices=vertices + self.offsets(values, examples))
 
 

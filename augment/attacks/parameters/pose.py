@@ -59,8 +59,7 @@ class Pose(Parameter):
         if not scene.settings.silhouettes:
             advice = "set silhouettes=True, since an attack on the pose needs them"
             raise InputError(f"silhouettes=False: {advice}", "silhouettes")
-        self._object_of = scene.object_of
-        self._vertices = scene.vertices
+        self._scene = scene
         masks = [torch.from_numpy(item.own_vertices) for item in scene.objects]
         # Mask of the vertices of each object itself, without props and table, shape (objects, N).
         self._object_masks = pad_sequence(masks, batch_first=True).to(scene.lights.device)
@@ -73,18 +72,6 @@ class Pose(Parameter):
         units = [settings.rotation] * 3 + [settings.shift] * 2 + [math.log1p(settings.scale)]
         units += [settings.view] * 2 + [math.log1p(settings.distance)]
         self._unit = torch.tensor(units, dtype=torch.float64).to(scene.lights)
-        limit = self._largest_values(scene, settings)
-        self.box = -limit, limit
-        # A value with the unit 0 has no effect.
-        used_mask = (self._unit > 0).expand(len(scene.object_of), -1)
-        super().__init__(settings, start=self._unit.new_zeros(used_mask.shape), used_mask=used_mask)
-
-    def _largest_values(self, scene: Scene, settings: PoseSettings) -> Tensor:
-        """Compute the largest magnitude of each attack value, shape (D,).
-
-        Scale and distance are limited, so that the object and a perspective
-        camera do not meet. The other values have no limit.
-        """
         all_cameras = chain.from_iterable(scene.cameras)
         cameras = [camera for camera in all_cameras if isinstance(camera, PerspectiveCamera)]
         distances = [camera.distance for camera in cameras]
@@ -92,13 +79,15 @@ class Pose(Parameter):
         # Logarithm of the factor by which the object can grow before it meets the nearest
         # perspective camera. It is infinite if there is no such camera.
         log_gap = math.log(min(distances, default=math.inf) / object_radius)
-        largest_log_factor = max(MAX_APPROACH * log_gap, 0.0)
-
+        # Largest magnitude of each attack value. Only scale and distance have limits, so that the
+        # object and a perspective camera do not meet. A unit may be 0.
         limit = torch.full_like(self._unit, math.inf)
-        # A unit may be 0.
-        units = self._unit[[SCALE, DISTANCE]].clamp(min=1e-9)
-        limit[[SCALE, DISTANCE]] = largest_log_factor / units
-        return limit
+        small_units = self._unit[[SCALE, DISTANCE]].clamp(min=1e-9)
+        limit[[SCALE, DISTANCE]] = max(MAX_APPROACH * log_gap, 0.0) / small_units
+        self.box = -limit, limit
+        # A value with the unit 0 has no effect.
+        used_mask = (self._unit > 0).expand(len(scene.object_of), -1)
+        super().__init__(settings, start=self._unit.new_zeros(used_mask.shape), used_mask=used_mask)
 
     def apply(self, values: Values, conditions: Conditions, examples: Examples) -> Conditions:
         """Return a copy of the conditions with moved objects and cameras.
@@ -106,11 +95,11 @@ class Pose(Parameter):
         The values are the pose divided by the units of the settings. Vertices that another
         parameter has displaced are moved, too.
         """
-        objects = self._object_of[examples]
+        objects = self._scene.object_of[examples]
         changes = values * self._unit
         vertices = conditions.vertices
         if vertices is None:
-            vertices = self._vertices[objects]
+            vertices = self._scene.vertices[objects]
         moved_vertices = [*map(self._moved, objects.tolist(), vertices, changes)]
         # `stack` refuses an empty list, as there is without examples.
         if moved_vertices:
