@@ -94,15 +94,13 @@ def remove_unfinished(folder: Path) -> None:
 
 def _require_replaceable(target: Path) -> None:
     """Raise `OSError` if a path is a folder, a device or a read-only file."""
-    if not target.exists():
-        return
-    if not target.is_file():
-        number = errno.EISDIR if target.is_dir() else errno.EINVAL
-        raise OSError(number, os.strerror(number))
-    # `os.replace` would replace a read-only file. Opening the file for
-    # appending raises an error if the file is read-only, and changes nothing.
-    with target.open("ab"):
-        pass
+    if target.exists():
+        if not (target.is_file() or target.is_dir()):
+            raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+        # `os.replace` would replace a read-only file. Opening the file for appending raises an
+        # error if it is a folder or read-only, and changes nothing.
+        with target.open("ab"):
+            pass
 
 
 def _flush(path: Path) -> None:

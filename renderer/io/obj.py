@@ -102,7 +102,7 @@ def read_obj(file: MeshFile) -> list[Part]:
     texels = [file.texture(*texture) for texture in textures]
     mesh = mesh_file.colored_mesh(vertices, faces, colors, corner_uvs, texture_ids, texels)
     normals = np.append(normals, [[0.0] * 3], axis=0)
-    return [Part(mesh, normals[normal_ids] if len(normals) > 1 else None)]
+    return [Part(mesh, normals[normal_ids])]
 
 
 def _cleaned(text: bytes) -> bytes:
@@ -167,9 +167,7 @@ def _polygons(lines: dict[str, _Lines]) -> tuple[np.ndarray, np.ndarray]:
 
 def _corners(words: list[bytes]) -> np.ndarray:
     """Parse corners such as 1/2/3 or 1//3 as rows of three, with `_LEFT_OUT` for no index."""
-    if not words:
-        return np.zeros((0, 3), dtype=np.int64)
-    text = b" ".join(words) + b" "
+    text = b" ".join([*words, b""])
     # Write a number for each index that is left out, so that all corners read alike.
     absent = b"/%d" % _LEFT_OUT
     text = text.replace(b"//", absent + b"/").replace(b"/ ", absent + b" ")
@@ -183,7 +181,7 @@ def _corners(words: list[bytes]) -> np.ndarray:
     # Place of each number in its corner: 0 for v, 1 for vt and 2 for vn.
     columns = np.arange(len(is_last)) - firsts[corners]
     numbers = mesh_file.parse_numbers(text.replace(b"/", b" "), np.int64)
-    if columns.max() > 2 or len(numbers) != len(columns):
+    if columns.max(initial=0) > 2 or len(numbers) != len(columns):
         raise ValueError("a corner of a face is not like 1, 1/2, 1//3 or 1/2/3")
     table = np.full((len(words), 3), _LEFT_OUT)
     table[corners, columns] = numbers
