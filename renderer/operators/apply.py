@@ -368,8 +368,8 @@ class TransferOperator:
         key = (background, lights.dtype, lights.device)
         is_kept = isinstance(background, float | int) and lights.ndim <= 2
         # Other threads may replace the pair meanwhile.
-        last_key, last = self._last_background.get("pair", (None, None))
-        if is_kept and last is not None and last_key == key:
+        last_key, last = vars(self).get("_last_background", (None, None))
+        if is_kept and last_key == key:
             return last
         images = as_background(background, self.settings.size, lights).flatten(-2)
         # Background of the P covered pixels. Only these mix with the mesh.
@@ -383,7 +383,7 @@ class TransferOperator:
         term = background_term(coverage, at_pixels, self.settings.encoding)
         prepared = (images, term)
         if is_kept:
-            self._last_background["pair"] = key, prepared
+            vars(self)["_last_background"] = key, prepared
         return prepared
 
     def to(self, device: torch.device | str) -> TransferOperator:
@@ -420,11 +420,6 @@ class TransferOperator:
         those of the colors.
         """
         return list(self.transfer)
-
-    @cached_property
-    def _last_background(self) -> dict[str, tuple[Any, tuple[Tensor, Tensor]]]:
-        """Key of the last gray background, and what was prepared for it ("pair")."""
-        return {}
 
     @cached_property
     def _placement(self) -> Tensor:
