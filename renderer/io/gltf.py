@@ -60,19 +60,19 @@ def read_gltf(file: MeshFile) -> list[Part]:
     gltf = GltfFile(file)
     for feature in ignored_features(gltf.tree):
         file.ignore(feature)
-    nodes = [node for node in gltf.scene_nodes() if "mesh" in gltf.tree["nodes"][node]]
     # Nodes may share a mesh, and meshes a material. Each is read once and cached.
     material = cache(partial(read_material, gltf))
     read_part = cache(partial(_read_part, gltf, material))
     placed_parts = []
     # Bytes of memory for all parts.
     needed = 0
-    for index in nodes:
+    for index in gltf.scene_nodes():
         node = gltf.tree["nodes"][index]
+        # A scale of 0 hides an object.
+        if "mesh" not in node or not gltf.poses[index][:3, :3].any():
+            continue
         if "skin" in node:
             raise ValueError("joints move its vertices: apply the armature, and export it")
-        if not gltf.poses[index][:3, :3].any():  # A scale of 0 hides an object.
-            continue
         mesh = gltf.entry("meshes", node["mesh"])
         # Weights of the morph targets. Those of the node replace those of the mesh.
         weights = tuple(node.get("weights", mesh.get("weights", ())))

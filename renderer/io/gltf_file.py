@@ -447,7 +447,7 @@ def _specular_glossiness(material: Material, file: GltfFile, model: dict[str, An
     """
     material = _with_color(material, file, model, "diffuse")
     # Specular color and glossiness become arrays (H, W, 3) and (H, W) if there is a texture.
-    specular = _factor(model, "specularFactor", 3)
+    specular = np.clip(model.get("specularFactor", [1.0] * 3), 0.0, 1.0)
     glossiness = np.array(model.get("glossinessFactor", 1.0))
     placement = None
     if "specularGlossinessTexture" in model:
@@ -484,17 +484,10 @@ def _specular_glossiness(material: Material, file: GltfFile, model: dict[str, An
     return material.with_gloss_texture(texture.astype(np.uint8), placement)
 
 
-def _factor(model: dict[str, Any], name: str, count: int) -> np.ndarray:
-    """Return a factor of a material in [0, 1], which is 1 by default."""
-    factor = np.array(model.get(name, [1] * count), dtype=np.float64)
-    if factor.shape != (count,):
-        raise ValueError(f"{name} has the shape {factor.shape} instead of ({count},)")
-    return np.clip(factor, 0, 1)
-
-
 def _with_color(material: Material, file: GltfFile, model: dict[str, Any], name: str) -> Material:
     """Return a material with the factor and the texture whose names begin with `name`."""
-    material = replace(material, color=_factor(model, f"{name}Factor", 4))
+    color = np.clip(model.get(f"{name}Factor", [1.0] * 4), 0.0, 1.0)
+    material = replace(material, color=color)
     if f"{name}Texture" not in model:
         return material
     image, placement = _image(file, model[f"{name}Texture"])

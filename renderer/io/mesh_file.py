@@ -17,7 +17,6 @@ from jaxtyping import Bool, Float, Int, Num
 from PIL import Image, UnidentifiedImageError
 
 from renderer.errors import MAX_MAGNITUDE, require_memory
-from renderer.image import decode, encode
 from renderer.io.files import file_below
 from renderer.io.images import eight_bits, identify
 from renderer.mesh import NO_TEXTURE, Mesh, transformed
@@ -288,12 +287,6 @@ def beside_textures(
             "the texture is taken as the color, and not the colors of its vertices or faces"
         )
     return np.where(is_textured[:, None, None], 1.0, colors)
-
-
-def product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Multiply the linear values of sRGB-encoded colors, and encode the product."""
-    factors = [decode(torch.from_numpy(colors), "srgb") for colors in (first, second)]
-    return encode(factors[0] * factors[1], "srgb").numpy()
 
 
 # Axes that remain if a polygon is projected along the axis x, y or z. A

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from renderer.image import encode
+from renderer.image import decode, encode
 from renderer.io import mesh_file
 from renderer.io.mesh_file import MeshFile, Part
 from renderer.mesh import NO_TEXTURE
@@ -96,7 +96,8 @@ def read_obj(file: MeshFile) -> list[Part]:
     if vertex_colors is not None:
         is_textured = texture_ids != NO_TEXTURE
         used_colors = mesh_file.beside_textures(vertex_colors[faces], is_textured, file)
-        colors = mesh_file.product(colors, used_colors)
+        first, second = (decode(torch.from_numpy(c), "srgb") for c in (colors, used_colors))
+        colors = encode(first * second, "srgb").numpy()
     # The row at the end is for corners without texture coordinates, whose index is -1.
     corner_uvs = np.append(uvs[:, :2], [[np.nan] * 2], axis=0)[uv_ids]
     texels = [file.texture(*texture) for texture in textures]
