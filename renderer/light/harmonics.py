@@ -72,8 +72,7 @@ def degree_of(light: Float[Tensor, "coefficients 3"]) -> int:
         InputError: If no degree has this number of coefficients.
     """
     light = as_tensor("light", light)
-    if light.shape[-1:] != (3,):
-        require_shape("light", light, "(degree + 1)²", 3)
+    require_shape("light", light, "(degree + 1)²", 3)
     return _degree_of_rows("light", light)
 
 
