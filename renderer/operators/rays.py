@@ -35,14 +35,7 @@ from renderer.mesh import Mesh
 from renderer.normals import face_normals
 from renderer.operators.apply import SparseTransfer
 from renderer.settings import ImageSettings
-from renderer.surface.gloss import (
-    IGNORED_PERCENT,
-    Gloss,
-    SampleGloss,
-    at_samples,
-    sample_gloss,
-    toward_camera,
-)
+from renderer.surface.gloss import Gloss, SampleGloss, at_samples, sample_gloss, toward_camera
 from renderer.surface.shading import normals_in_sight, smooth_normals
 from renderer.vectors import unit, unit_vectors
 from renderer.visibility.fragments import Fragments
@@ -161,16 +154,8 @@ class Surface:
 
     @property
     def lobe_width(self) -> float:
-        """Smallest width α = roughness² of the specular lobes. Infinite for a matte surface.
-
-        As in `smallest_roughness`, the 1% of the samples with the smallest roughness do not count.
-        """
-        if self.gloss is None:
-            return math.inf
-        roughness, *factors = torch.broadcast_tensors(*(values.detach() for values in self.gloss))
-        roughness = roughness[(factors[0] > 0) | (factors[1] > 0)]
-        rank = 1 + len(roughness) * IGNORED_PERCENT // 100
-        return float(roughness.kthvalue(rank).values) ** 2 if len(roughness) else math.inf
+        """Smallest width α of the specular lobes (`SampleGloss`). Infinite for a matte surface."""
+        return math.inf if self.gloss is None else self.gloss.lobe_width
 
     @cached_property
     def toward(self) -> Tensor:
