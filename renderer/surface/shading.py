@@ -267,7 +267,8 @@ class _Irradiance(torch.autograd.Function):
             degree = math.isqrt(len(light)) - 1
             # The polynomial is the irradiance only for unit normals. For normals of length
             # 0, the harmonics are evaluated instead.
-            nonzero, irradiance_per_unit = _diffuse_basis(directions[:, zero_normals], degree)
+            zeros = directions[:, zero_normals]
+            nonzero, irradiance_per_unit = harmonics.diffuse_basis(zeros, degree)
             value[:, zero_normals] = light[nonzero].T @ irradiance_per_unit
         ctx.save_for_backward(directions, lengths, gradient if ctx.needs_input_grad[0] else None)
         ctx.light_shape = light.shape
@@ -295,7 +296,7 @@ class _Irradiance(torch.autograd.Function):
             degree = math.isqrt(ctx.light_shape[0]) - 1
             light_gradient = directions.new_zeros(ctx.light_shape)
             for block_directions, block_upstream in split_samples(directions, upstream):
-                nonzero, irradiance_per_unit = _diffuse_basis(block_directions, degree)
+                nonzero, irradiance_per_unit = harmonics.diffuse_basis(block_directions, degree)
                 light_gradient[nonzero] += irradiance_per_unit @ block_upstream.T
         return normal_gradient, light_gradient
 
@@ -378,13 +379,6 @@ def _gradients(degree: int) -> Tensor:
     in_monomials = harmonics.monomial_coefficients(degree - 1) @ in_harmonics
     has_same_parity = band % 2 == degree % 2
     return in_monomials * ((band > 0) & has_same_parity)
-
-
-def _diffuse_basis(directions: Float[Tensor, "3 N"], degree: int) -> tuple[list[int], Tensor]:
-    """Compute the ascending indices of the M harmonics that count, and their irradiance (M, N)."""
-    nonzero = harmonics.nonzero_coefficients(degree).tolist()
-    factors = harmonics.lambertian_factors(degree).to(directions)[nonzero, None]
-    return nonzero, torch.stack(harmonics.evaluate_harmonics(directions, nonzero)) * factors
 
 
 def normals_in_sight(
