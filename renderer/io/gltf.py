@@ -222,11 +222,6 @@ class _AlphaTexture:
                 high = np.maximum(high, np.roll(high, step, axis))
             self._levels.append(np.stack([low, high]))
 
-    def positions(self, values: np.ndarray) -> np.ndarray:
-        """Compute the positions (column, row), in texels, of vertices, shape (V, 2)."""
-        height, width = self.texels.shape
-        return np.stack([values[:, U] * width - 0.5, (1 - values[:, V]) * height - 0.5], axis=1)
-
     def ranges(self, positions: np.ndarray) -> np.ndarray:
         """Return bounds (2, F) of alpha within F faces with corners at positions (F, 3, 2)."""
         # First texel, and number of columns and rows, of the rectangle around each face.
@@ -255,7 +250,9 @@ def _cut_out(given: _Surface, texels: UInt8[np.ndarray, "H W"] | None, cutoff: f
     texture = _AlphaTexture(np.full((1, 1), FULL, np.uint8) if texels is None else texels)
     while True:
         values, faces = surface
-        positions = texture.positions(values)
+        # Columns and rows of the vertices, in texels, shape (V, 2).
+        height, width = texture.texels.shape
+        positions = np.stack([values[:, U] * width, (1 - values[:, V]) * height], axis=1) - 0.5
         corners = positions[faces]
         # Smallest and largest alpha of the texture within each face, shape (F,).
         low, high = texture.ranges(corners)

@@ -78,7 +78,6 @@ class MeshFile:
         # Dictionaries without values, because sets have no order.
         self._ignored: dict[str, None] = {}
         self._assumptions: dict[str, None] = {}
-        self._textures: dict[str, np.ndarray] = {}
 
     def read(self, name: str, folder: str = "") -> bytes:
         """Read a file below the folder of the mesh file.
@@ -103,13 +102,10 @@ class MeshFile:
 
     def texture(self, name: str, folder: str = "") -> np.ndarray:
         """Read an image file as a texture, uint8, shape (H, W, 3)."""
-        key = folder + name
-        if key not in self._textures:
-            pixels = np.array(decode_image(self.read(name, folder), name).convert("RGBA"))
-            if pixels[..., 3].min() < 255:
-                self.assume(f"the alpha of {name} is ignored")
-            self._textures[key] = np.ascontiguousarray(pixels[..., :3])
-        return self._textures[key]
+        pixels = np.array(decode_image(self.read(name, folder), name).convert("RGBA"))
+        if pixels[..., 3].min() < 255:
+            self.assume(f"the alpha of {name} is ignored")
+        return np.ascontiguousarray(pixels[..., :3])
 
     def ignore(self, feature: str) -> None:
         """Note that a feature is ignored, which changes neither the shape nor the base color."""

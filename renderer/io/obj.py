@@ -2,6 +2,7 @@
 
 import re
 from contextlib import suppress
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -190,17 +191,17 @@ def _corners(words: list[bytes]) -> np.ndarray:
 
 
 def _materials(lines: dict[str, _Lines], file: MeshFile) -> tuple[list[_Material], np.ndarray]:
-    """Read the used materials, a white one first, and find the index of the one of each face."""
+    """Read the used materials, and find the index of the one of each face."""
     library = _library(lines["mtllib"].names(), file)
-    # Name of the material of each line "usemtl", after None for faces before these lines. Blender
+    # A material may be used by many lines.
+    read = cache(lambda name: _material(name, library, file) if name else _Material())
+    # Name of the material of each line "usemtl", after "" for faces before these lines. Blender
     # writes a line without a name for faces without a material.
-    names = [None, *(name or None for name in lines["usemtl"].names())]
+    names = ["", *lines["usemtl"].names()]
     # Each face has the material of the last line "usemtl" before it.
-    choice_of_face = np.searchsorted(lines["usemtl"].numbers, lines["f"].numbers)
-    used = list(dict.fromkeys([None, *(names[choice] for choice in np.unique(choice_of_face))]))
-    materials = [_Material() if name is None else _material(name, library, file) for name in used]
-    ids = [used.index(name) if name in used else 0 for name in names]
-    return materials, np.array(ids)[choice_of_face]
+    line_of_face = np.searchsorted(lines["usemtl"].numbers, lines["f"].numbers)
+    used_lines, material_of_face = np.unique(line_of_face, return_inverse=True)
+    return [read(names[line]) for line in used_lines], material_of_face
 
 
 def _library(names: list[str], file: MeshFile) -> dict[str, _Definition] | None:
