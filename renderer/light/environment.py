@@ -17,6 +17,7 @@ import errno
 import math
 import warnings
 from collections.abc import Sequence
+from itertools import takewhile
 from pathlib import Path
 from types import ModuleType
 
@@ -211,10 +212,8 @@ def _radiance_header(path: Path) -> tuple[np.ndarray, Sequence[float]]:
     factors = np.ones(3)
     chromaticities: Sequence[float] = REC_709
     with path.open("rb") as file:
-        for line in iter(file.readline, b""):
-            # An empty line ends the header.
-            if not line.strip():
-                break
+        # An empty line ends the header.
+        for line in takewhile(bytes.strip, file):
             key, _, value = line.decode("latin-1").partition("=")
             if key in ("EXPOSURE", "COLORCORR"):
                 # One number is broadcast to three channels, and two raise an error.

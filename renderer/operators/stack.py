@@ -63,15 +63,13 @@ class TransferOperators(Sequence[TransferOperator]):
                 the first one in settings, basis or dtype.
         """
         self._operators = list(operators)
-        if not self._operators:
+        kinds = {(each.settings, each.basis, each.transfer.dtype) for each in self._operators}
+        if not kinds:
             raise InputError("operators is empty: give at least one TransferOperator")
-        first = self._operators[0]
-        for operator in self._operators:
-            is_same = operator.settings == first.settings and operator.basis == first.basis
-            if not is_same or operator.transfer.dtype != first.transfer.dtype:
-                fault = "operators differ in image settings, basis of light or dtype"
-                advice = "compute all operators with the same settings, basis and dtype"
-                raise InputError(f"{fault}: {advice}")
+        if len(kinds) > 1:
+            fault = "operators differ in image settings, basis of light or dtype"
+            advice = "compute all operators with the same settings, basis and dtype"
+            raise InputError(f"{fault}: {advice}")
 
     @overload
     def __getitem__(self, index: int) -> TransferOperator: ...
