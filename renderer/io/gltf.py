@@ -210,17 +210,18 @@ class _AlphaTexture:
     def __init__(self, texels: UInt8[np.ndarray, "H W"]) -> None:
         """Compute the minimum and the maximum of the 2^n × 2^n texels from each texel on."""
         self.texels = texels
-        # Each level has the axes: minimum or maximum, row, column. On level 0, both are the texel.
-        self._levels = [np.stack([texels, texels])]
-        while 2 ** (len(self._levels) - 1) < max(texels.shape):
-            low, high = self._levels[-1]
+        # Axes: level, minimum or maximum, row, column. On level 0, both are the texel.
+        level_count = 1 + (max(texels.shape) - 1).bit_length()
+        self._levels = np.tile(texels, (level_count, 2, 1, 1))
+        for level in range(1, level_count):
+            low, high = self._levels[level - 1]
             for axis in (0, 1):
                 # Two neighboring squares of half the size, first along rows and then along columns,
                 # make one of the next level. The texture repeats, so `roll` wraps around.
-                step = -(2 ** (len(self._levels) - 1))
+                step = -(2 ** (level - 1))
                 low = np.minimum(low, np.roll(low, step, axis))
                 high = np.maximum(high, np.roll(high, step, axis))
-            self._levels.append(np.stack([low, high]))
+            self._levels[level] = low, high
 
     def ranges(self, positions: np.ndarray) -> np.ndarray:
         """Return bounds (2, F) of alpha within F faces with corners at positions (F, 3, 2)."""
@@ -232,11 +233,7 @@ class _AlphaTexture:
         levels = np.ceil(np.log2(extent.max(axis=1))).astype(np.int64)
         levels = np.minimum(levels, len(self._levels) - 1)
         column, row = (start % self.texels.shape[::-1]).T
-        bounds = np.empty((2, len(positions)))
-        for level in np.unique(levels):
-            faces = levels == level
-            bounds[:, faces] = self._levels[level][:, row[faces], column[faces]]
-        return bounds / FULL
+        return self._levels[levels, :, row, column].T / FULL
 
 
 def _cut_out(given: _Surface, texels: UInt8[np.ndarray, "H W"] | None, cutoff: float) -> _Surface:
