@@ -253,10 +253,9 @@ def perturb(
     # Axes: light, coefficient, color.
     offsets = (torch.rand(count, *light.shape, generator=generator) * 2 - 1) * amplitude
     if radius is not None:
-        diffuse_indices = harmonics.nonzero_coefficients(harmonics.degree_of(light))
-        # 1 for coefficients that change the irradiance of a surface, 0 for the others.
-        mask = torch.zeros(len(light), 1).index_fill_(0, diffuse_indices, 1.0)
-        offsets = offsets * mask
+        # True for coefficients that change the irradiance of a surface.
+        is_diffuse = harmonics.lambertian_factors(harmonics.degree_of(light)) != 0
+        offsets = offsets * is_diffuse[:, None]
         norms = offsets.flatten(1).norm(dim=1).clamp(min=1e-12)
         offsets = offsets * (radius / norms)[:, None, None]
     return light + offsets.to(light)
