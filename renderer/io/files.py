@@ -29,13 +29,20 @@ def replacing(
 
     At the end of the block, the temporary file is moved to `path`. If the block
     raises an error, the temporary file is removed and the old file stays. If `path` is a symbolic
-    link, the file it points to is replaced. `durable` waits about 20 ms until the file is on the
+    link, the file it points to is replaced. A folder, a device or a read-only file raises
+    `OSError`. `durable` waits about 20 ms until the file is on the
     disk. The old file is moved to `previous`, or deleted.
     """
     target = Path(os.path.realpath(path))
     temporary = target.with_name(TEMPORARY.replace("*", uuid4().hex))
     try:
-        _require_replaceable(target)
+        if target.exists():
+            if not (target.is_file() or target.is_dir()):
+                raise OSError(errno.EINVAL, os.strerror(errno.EINVAL))
+            # `os.replace` would replace a read-only file. Opening the file for appending raises an
+            # error if it is a folder or read-only, and changes nothing.
+            with target.open("ab"):
+                pass
         yield temporary
         if target.exists():
             shutil.copymode(target, temporary)
@@ -90,19 +97,6 @@ def remove_unfinished(folder: Path) -> None:
     """Remove the temporary files of a killed process, if no other process writes to the folder."""
     for unfinished in folder.glob(TEMPORARY):
         unfinished.unlink(missing_ok=True)
-
-
-def _require_replaceable(target: Path) -> None:
-    """Raise `OSError` if a path is a folder, a device or a read-only file."""
-    if not target.exists():
-        return
-    if not target.is_file():
-        number = errno.EISDIR if target.is_dir() else errno.EINVAL
-        raise OSError(number, os.strerror(number))
-    # `os.replace` would replace a read-only file. Opening the file for
-    # appending raises an error if the file is read-only, and changes nothing.
-    with target.open("ab"):
-        pass
 
 
 def _flush(path: Path) -> None:

@@ -11,7 +11,7 @@ straight within such a face.
 """
 
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -55,25 +55,25 @@ class _Surface(NamedTuple):
     faces: Int[np.ndarray, "F 3"]
 
 
-def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
+def read_gltf(file: MeshFile) -> list[Part]:
     """Read the parts of a .gltf or .glb file in the axes of its scene."""
-    file = GltfFile(mesh_file)
-    for feature in ignored_features(file.tree):
-        mesh_file.ignore(feature)
-    nodes = [node for node in file.scene_nodes() if "mesh" in file.tree["nodes"][node]]
+    gltf = GltfFile(file)
+    for feature in ignored_features(gltf.tree):
+        file.ignore(feature)
     # Nodes may share a mesh, and meshes a material. Each is read once and cached.
-    material = cache(lambda index: read_material(file, index, gloss))
-    read_part = cache(lambda *key: _read_part(file, material, *key))
+    material = cache(partial(read_material, gltf))
+    read_part = cache(partial(_read_part, gltf, material))
     placed_parts = []
     # Bytes of memory for all parts.
     needed = 0
-    for index in nodes:
-        node = file.tree["nodes"][index]
+    for index in gltf.scene_nodes():
+        node = gltf.tree["nodes"][index]
+        # A scale of 0 hides an object.
+        if "mesh" not in node or not gltf.poses[index][:3, :3].any():
+            continue
         if "skin" in node:
             raise ValueError("joints move its vertices: apply the armature, and export it")
-        if not file.poses[index][:3, :3].any():  # A scale of 0 hides an object.
-            continue
-        mesh = file.entry("meshes", node["mesh"])
+        mesh = gltf.entry("meshes", node["mesh"])
         # Weights of the morph targets. Those of the node replace those of the mesh.
         weights = tuple(node.get("weights", mesh.get("weights", ())))
         for number, primitive in enumerate(mesh["primitives"]):
@@ -81,15 +81,15 @@ def read_gltf(mesh_file: MeshFile, gloss: bool) -> list[Part]:
             if mode > TRIANGLES:
                 raise ValueError("it has strips or fans of triangles: export single triangles")
             if mode < TRIANGLES:
-                mesh_file.ignore("points and lines")
+                file.ignore("points and lines")
             else:
                 surface, material_of_part = read_part(node["mesh"], number, weights)
                 # A small file can show one mesh very often.
                 needed += FACE_BYTES * len(surface.faces)
                 needed += VERTEX_BYTES * len(surface.values)
                 require_memory("its faces", needed, CPU)
-                placed_parts += _place(surface, material_of_part, file.poses[index])
-    modes = {material.get("alphaMode") for material in file.tree.get("materials", ())}
+                placed_parts += _place(surface, material_of_part, gltf.poses[index])
+    modes = {material.get("alphaMode") for material in gltf.tree.get("materials", ())}
     if not placed_parts and "MASK" in modes:
         raise ValueError("its alpha cuts out all faces (alphaMode MASK): use OPAQUE")
     return placed_parts
@@ -112,16 +112,13 @@ def _read_part(
     faces = _faces(file, primitive, len(positions))
     # Linear red, green, blue and alpha of each vertex. Without COLOR_0, they are 1.
     colors = np.ones((len(positions), 4))
-    if "COLOR_0" in attributes:
-        # The file may leave out alpha, the fourth column.
-        file_colors = attributes["COLOR_0"]
-        colors[:, : file_colors.shape[1]] = np.clip(file_colors, 0, 1)
+    # The file may leave out alpha, the fourth column.
+    file_colors = attributes.get("COLOR_0", colors)
+    colors[:, : file_colors.shape[1]] = np.clip(file_colors, 0, 1)
     colors *= material.color
-    uvs = np.zeros((len(positions), 2))
-    if material.placement is not None:
-        if uv_name not in attributes:
-            raise ValueError("the mesh has a texture, but no texture coordinates")
-        uvs = attributes[uv_name]
+    if material.placement is not None and uv_name not in attributes:
+        raise ValueError("the mesh has a texture, but no texture coordinates")
+    uvs = attributes.get(uv_name, np.zeros((len(positions), 2)))
     require_bounded(coordinates=positions, colors=colors, **{"texture coordinates": uvs})
     # From here on, texture coordinates are those of `Mesh`: textures repeat, and v points up.
     material, uvs = material.placed(uvs, file)
@@ -153,9 +150,7 @@ def _attributes(
         attributes[name] = values.astype(np.float64)
     # Each morph target has changes of attributes, which are added with a weight each.
     targets = primitive.get("targets", [])
-    if weights and len(weights) != len(targets):
-        raise ValueError(f"it has {len(weights)} weights for {len(targets)} morph targets")
-    for weight, target in zip(weights, targets, strict=False):
+    for weight, target in zip(weights, targets, strict=bool(weights)):
         for name, index in target.items():
             if weight != 0 and name in attributes:
                 change = file.array(index)
@@ -163,10 +158,6 @@ def _attributes(
                 if len(change) != len(attributes[name]):
                     raise ValueError(f"a morph target has {len(change)} entries of {name}")
                 attributes[name] = attributes[name] + weight * change
-    vertex_count = len(attributes["POSITION"])
-    for name, values in attributes.items():
-        if len(values) != vertex_count:
-            raise ValueError(f"{name} has {len(values)} entries for {vertex_count} vertices")
     return attributes
 
 
@@ -204,9 +195,7 @@ def _place(surface: _Surface, material: Material, pose: Float[np.ndarray, "4 4"]
         gloss = np.tile(material.gloss.astype(np.float32), (len(faces), 1))
         texture = material.gloss_texture
         mesh = replace(mesh, gloss=gloss, gloss_textures=() if texture is None else (texture,))
-    # Normals of 0 mean that the file has none.
-    normals = corners[..., NORMAL] if corners[..., NORMAL].any() else None
-    return [Part(mesh, normals, pose)]
+    return [Part(mesh, corners[..., NORMAL], pose)]
 
 
 # Largest alpha of a texel.
@@ -221,22 +210,18 @@ class _AlphaTexture:
     def __init__(self, texels: UInt8[np.ndarray, "H W"]) -> None:
         """Compute the minimum and the maximum of the 2^n × 2^n texels from each texel on."""
         self.texels = texels
-        # Each level has the axes: minimum or maximum, row, column. On level 0, both are the texel.
-        self._levels = [np.stack([texels, texels])]
-        while 2 ** (len(self._levels) - 1) < max(texels.shape):
-            low, high = self._levels[-1]
+        # Axes: level, minimum or maximum, row, column. On level 0, both are the texel.
+        level_count = 1 + (max(texels.shape) - 1).bit_length()
+        self._levels = np.tile(texels, (level_count, 2, 1, 1))
+        for level in range(1, level_count):
+            low, high = self._levels[level - 1]
             for axis in (0, 1):
                 # Two neighboring squares of half the size, first along rows and then along columns,
                 # make one of the next level. The texture repeats, so `roll` wraps around.
-                step = -(2 ** (len(self._levels) - 1))
+                step = -(2 ** (level - 1))
                 low = np.minimum(low, np.roll(low, step, axis))
                 high = np.maximum(high, np.roll(high, step, axis))
-            self._levels.append(np.stack([low, high]))
-
-    def positions(self, values: np.ndarray) -> np.ndarray:
-        """Compute the positions (column, row), in texels, of vertices, shape (V, 2)."""
-        height, width = self.texels.shape
-        return np.stack([values[:, U] * width - 0.5, (1 - values[:, V]) * height - 0.5], axis=1)
+            self._levels[level] = low, high
 
     def ranges(self, positions: np.ndarray) -> np.ndarray:
         """Return bounds (2, F) of alpha within F faces with corners at positions (F, 3, 2)."""
@@ -248,11 +233,7 @@ class _AlphaTexture:
         levels = np.ceil(np.log2(extent.max(axis=1))).astype(np.int64)
         levels = np.minimum(levels, len(self._levels) - 1)
         column, row = (start % self.texels.shape[::-1]).T
-        bounds = np.empty((2, len(positions)))
-        for level in np.unique(levels):
-            faces = levels == level
-            bounds[:, faces] = self._levels[level][:, row[faces], column[faces]]
-        return bounds / FULL
+        return self._levels[levels, :, row, column].T / FULL
 
 
 def _cut_out(given: _Surface, texels: UInt8[np.ndarray, "H W"] | None, cutoff: float) -> _Surface:
@@ -266,7 +247,9 @@ def _cut_out(given: _Surface, texels: UInt8[np.ndarray, "H W"] | None, cutoff: f
     texture = _AlphaTexture(np.full((1, 1), FULL, np.uint8) if texels is None else texels)
     while True:
         values, faces = surface
-        positions = texture.positions(values)
+        # Columns and rows of the vertices, in texels, shape (V, 2).
+        height, width = texture.texels.shape
+        positions = np.stack([values[:, U] * width, (1 - values[:, V]) * height], axis=1) - 0.5
         corners = positions[faces]
         # Smallest and largest alpha of the texture within each face, shape (F,).
         low, high = texture.ranges(corners)

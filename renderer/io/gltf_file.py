@@ -292,8 +292,8 @@ class Material:
         The textures of `Mesh` repeat. A texture that is mirrored is therefore
         doubled, and a clamped texture is extended at its edges.
         """
-        if self.placement is None or self.texture is None:
-            return self, np.zeros((len(uvs), 2))
+        if self.placement is None:
+            return self, uvs
         # Transform texture coordinates by the matrix (2, 3) of the file.
         matrix = np.array(self.placement.transform)
         uvs = uvs @ matrix[:, :2].T + matrix[:, 2]
@@ -356,13 +356,6 @@ class Material:
         return replace(material, gloss_texture=texels)
 
 
-def _resized(texture: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Resize the channels of a texture to a width and a height."""
-    planes = [Image.fromarray(plane) for plane in np.moveaxis(texture, 2, 0)]
-    resized = [np.array(plane.resize(size, Image.Resampling.BILINEAR)) for plane in planes]
-    return np.stack(resized, axis=-1)
-
-
 def ignored_features(tree: dict[str, Any]) -> list[str]:
     """List the features of a file that change neither its shape nor its base color.
 
@@ -400,8 +393,8 @@ def _emits_its_color(material: dict[str, Any]) -> bool:
     return not any(base[:3]) and any(material.get("emissiveFactor", ()))
 
 
-def read_material(file: GltfFile, index: int | None, gloss: bool) -> Material:
-    """Read a material. Without an index, it is white and matte. Without `gloss`, it is matte."""
+def read_material(file: GltfFile, index: int | None) -> Material:
+    """Read a material. Without an index, it is white and matte."""
     if index is None:
         return Material(color=np.ones(4))
     entry = file.entry("materials", index)
@@ -410,11 +403,9 @@ def read_material(file: GltfFile, index: int | None, gloss: bool) -> Material:
         if extensions.get(name, {}).get(factor, 0) > 0:
             raise ValueError(f"a material lets light pass ({name}): make it opaque")
     mode = entry.get("alphaMode", "OPAQUE")
-    if mode not in ("OPAQUE", "MASK", "BLEND"):
-        raise ValueError(f"a material has the alphaMode {mode}: use OPAQUE, MASK or BLEND")
     material = Material(np.ones(4), mode, entry.get("alphaCutoff", 0.5))
     if SPECULAR_GLOSSINESS in extensions:
-        return _specular_glossiness(material, file, extensions[SPECULAR_GLOSSINESS], gloss)
+        return _specular_glossiness(material, file, extensions[SPECULAR_GLOSSINESS])
     # The model of glTF itself (3.9.2).
     model = entry.get("pbrMetallicRoughness", {})
     if _emits_its_color(entry):
@@ -423,7 +414,7 @@ def read_material(file: GltfFile, index: int | None, gloss: bool) -> Material:
         material = _with_color(material, file, emission, "emissive")
     else:
         material = _with_color(material, file, model, "baseColor")
-    if not gloss:
+    if not file.file.gloss:
         return material
     # Roughness, metallic and specular factor.
     factors = [model.get("roughnessFactor", 1), model.get("metallicFactor", 1)]
@@ -449,16 +440,14 @@ def _specular_factor(extensions: dict[str, Any]) -> float:
     return float(specular.get("specularFactor", 1.0) * min(colors[0] * reflectance, 1) / DIELECTRIC)
 
 
-def _specular_glossiness(
-    material: Material, file: GltfFile, model: dict[str, Any], gloss: bool
-) -> Material:
+def _specular_glossiness(material: Material, file: GltfFile, model: dict[str, Any]) -> Material:
     """Return a material with the color and the gloss of KHR_materials_pbrSpecularGlossiness.
 
     The albedo of this extension is diffuse · (1 - max(specular)).
     """
     material = _with_color(material, file, model, "diffuse")
     # Specular color and glossiness become arrays (H, W, 3) and (H, W) if there is a texture.
-    specular = _factor(model, "specularFactor", 3)
+    specular = np.clip(model.get("specularFactor", [1.0] * 3), 0.0, 1.0)
     glossiness = np.array(model.get("glossinessFactor", 1.0))
     placement = None
     if "specularGlossinessTexture" in model:
@@ -473,13 +462,14 @@ def _specular_glossiness(
     else:
         material = material.with_placement(placement, reflectance.shape)
         assert material.texture is not None
-        fraction = (1 - reflectance[..., None]).astype(np.float32)
-        fraction = _resized(fraction, material.texture.shape[1::-1])
+        size = material.texture.shape[1::-1]
+        fraction = Image.fromarray((1 - reflectance).astype(np.float32))
+        factors = np.array(fraction.resize(size, Image.Resampling.BILINEAR))[..., None]
         # Colors are multiplied as linear light and encoded again.
         linear = decode(torch.from_numpy(material.texture).float() / 255, "srgb")
-        dimmed = to_bytes(encode(linear * torch.from_numpy(fraction), "srgb"))
+        dimmed = to_bytes(encode(linear * torch.from_numpy(factors), "srgb"))
         material = replace(material, texture=dimmed.numpy())
-    if not gloss:
+    if not file.file.gloss:
         return material
     # The renderer has one specular factor without a color, so the mean replaces the texture.
     factor = min(float(reflectance.mean()) / DIELECTRIC, 1.0)
@@ -489,22 +479,15 @@ def _specular_glossiness(
     if placement is None:
         return replace(material, gloss=np.array([float(roughness), 0, factor]))
     # The gloss texture has roughness and metallic. Metallic is multiplied by 0 below.
-    factors = np.stack([np.rint(255 * roughness), np.full(roughness.shape, 255)], axis=-1)
+    texture = np.stack([np.rint(255 * roughness), np.full(roughness.shape, 255)], axis=-1)
     material = replace(material, gloss=np.array([1.0, 0, factor]))
-    return material.with_gloss_texture(factors.astype(np.uint8), placement)
-
-
-def _factor(model: dict[str, Any], name: str, count: int) -> np.ndarray:
-    """Return a factor of a material in [0, 1], which is 1 by default."""
-    factor = np.array(model.get(name, [1] * count), dtype=np.float64)
-    if factor.shape != (count,):
-        raise ValueError(f"{name} has the shape {factor.shape} instead of ({count},)")
-    return np.clip(factor, 0, 1)
+    return material.with_gloss_texture(texture.astype(np.uint8), placement)
 
 
 def _with_color(material: Material, file: GltfFile, model: dict[str, Any], name: str) -> Material:
     """Return a material with the factor and the texture whose names begin with `name`."""
-    material = replace(material, color=_factor(model, f"{name}Factor", 4))
+    color = np.clip(model.get(f"{name}Factor", [1.0] * 4), 0.0, 1.0)
+    material = replace(material, color=color)
     if f"{name}Texture" not in model:
         return material
     image, placement = _image(file, model[f"{name}Texture"])

@@ -26,13 +26,7 @@ from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt8
-from PIL import ExifTags, Image, ImageCms, ImageDraw, ImageFont, ImageOps
-from PIL.TiffImagePlugin import (
-    BITSPERSAMPLE,
-    PHOTOMETRIC_INTERPRETATION,
-    PLANAR_CONFIGURATION,
-    TiffImageFile,
-)
+from PIL import ExifTags, Image, ImageCms, ImageDraw, ImageFont, ImageOps, TiffImagePlugin
 
 from renderer.errors import InputError, keyed, reading, require_file
 from renderer.io.files import atomic_write
@@ -112,9 +106,9 @@ def identify(file: BinaryIO) -> Image.Image:
     """Return the image in a stream of bytes, without decoding its pixels."""
     image = Image.open(file, formats=FORMATS)
     # Pillow reads 16 bits as 8 if the channels of a TIFF file are stored one after the other.
-    tags = image.tag_v2 if isinstance(image, TiffImageFile) else {}
-    is_apart = tags.get(PLANAR_CONFIGURATION) == 2 and image.tile[0][0] == "raw"
-    if is_apart and max(tags.get(BITSPERSAMPLE, (1,))) > 8:
+    tags = image.tag_v2 if isinstance(image, TiffImagePlugin.TiffImageFile) else {}
+    is_apart = tags.get(TiffImagePlugin.PLANAR_CONFIGURATION) == 2 and image.tile[0][0] == "raw"
+    if is_apart and max(tags.get(TiffImagePlugin.BITSPERSAMPLE, (1,))) > 8:
         raise ValueError("its channels of 16 bits are stored apart: save them interleaved")
     key = image.info.get("transparency")
     if image.format == "PNG" and key is not None:
@@ -205,11 +199,11 @@ def eight_bits(image: Image.Image) -> Image.Image:
         # Pixels of the mode "I" have 16 bits, or the 12 bits of a TIFF file. `Image.convert`
         # would clip their values at 255 instead of dividing them.
         pixels = np.asarray(image)
-        tags = image.tag_v2 if isinstance(image, TiffImageFile) else {}
-        bits = tags.get(BITSPERSAMPLE, (16,))[0]
+        tags = image.tag_v2 if isinstance(image, TiffImagePlugin.TiffImageFile) else {}
+        bits = tags.get(TiffImagePlugin.BITSPERSAMPLE, (16,))[0]
         values = np.clip(pixels >> (bits - 8), 0, 255).astype(np.uint8)
         # Pillow inverts such a TIFF file only if it has at most 8 bits.
-        is_white_zero = tags.get(PHOTOMETRIC_INTERPRETATION) == 0
+        is_white_zero = tags.get(TiffImagePlugin.PHOTOMETRIC_INTERPRETATION) == 0
         scaled = Image.fromarray(255 - values if is_white_zero else values)
         key = image.info.get("transparency")
         # Pixels of the transparent color of a 16-bit image get an opacity of 0.

@@ -17,7 +17,6 @@ from jaxtyping import Bool, Float, Int, Num
 from PIL import Image, UnidentifiedImageError
 
 from renderer.errors import MAX_MAGNITUDE, require_memory
-from renderer.image import decode, encode
 from renderer.io.files import file_below
 from renderer.io.images import eight_bits, identify
 from renderer.mesh import NO_TEXTURE, Mesh, transformed
@@ -38,27 +37,24 @@ class Part(NamedTuple):
     Attributes:
         mesh: Mesh in its own coordinates.
         normals: Normals of the corners of the faces in the file, of any length,
-            shape (F, 3, 3). Zero for corners without a normal. None if the file has
-            no normals.
+            shape (F, 3, 3). Zero for corners without a normal.
         matrix: Affine matrix that places the mesh in the scene, shape (4, 4).
     """
 
     mesh: Mesh
-    normals: Float[np.ndarray, "F 3 3"] | None = None
+    normals: Float[np.ndarray, "F 3 3"]
     matrix: Float[np.ndarray, "4 4"] = np.eye(4)
 
     def placed(self) -> tuple[Mesh, Float[np.ndarray, "F 3 3"]]:
-        """Return the mesh in the axes of the scene, and its normals there or zeros."""
+        """Return the mesh in the axes of the scene, and its normals there."""
         mesh = transformed(self.mesh, self.matrix)
-        if self.normals is None:
-            return mesh, np.zeros((len(mesh.faces), 3, 3))
         # Only finite normals count. Some programs write NaN for faces without area.
         normals = np.where(np.abs(self.normals) <= MAX_MAGNITUDE, self.normals, 0)
         # The matrix of cofactors is the inverse of the transpose times the determinant,
         # and exists even without an inverse.
-        u, v, w = self.matrix[:3, :3]
-        cofactors = np.array([np.cross(v, w), np.cross(w, u), np.cross(u, v)])
-        if u @ cofactors[0] < 0:
+        axes = self.matrix[:3, :3]
+        cofactors = np.cross(axes[[1, 2, 0]], axes[[2, 0, 1]])
+        if axes[0] @ cofactors[0] < 0:
             # `transformed` reverses the corners of a mirrored mesh.
             return mesh, normals[:, [0, 2, 1]] @ -cofactors.T
         return mesh, normals @ cofactors.T
@@ -69,18 +65,19 @@ class MeshFile:
 
     Attributes:
         path: Path of the file.
+        gloss: True if the gloss of materials is read, too.
         content: Content of the file.
+        beside: Files that were read beside the mesh.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, gloss: bool) -> None:
         self.path = path
+        self.gloss = gloss
         self.content = path.read_bytes()
-        # Files that were read beside the mesh.
         self.beside: set[Path] = set()
         # Dictionaries without values, because sets have no order.
         self._ignored: dict[str, None] = {}
         self._assumptions: dict[str, None] = {}
-        self._textures: dict[str, np.ndarray] = {}
 
     def read(self, name: str, folder: str = "") -> bytes:
         """Read a file below the folder of the mesh file.
@@ -105,13 +102,10 @@ class MeshFile:
 
     def texture(self, name: str, folder: str = "") -> np.ndarray:
         """Read an image file as a texture, uint8, shape (H, W, 3)."""
-        key = folder + name
-        if key not in self._textures:
-            pixels = np.array(decode_image(self.read(name, folder), name).convert("RGBA"))
-            if pixels[..., 3].min() < 255:
-                self.assume(f"the alpha of {name} is ignored")
-            self._textures[key] = np.ascontiguousarray(pixels[..., :3])
-        return self._textures[key]
+        pixels = np.array(decode_image(self.read(name, folder), name).convert("RGBA"))
+        if pixels[..., 3].min() < 255:
+            self.assume(f"the alpha of {name} is ignored")
+        return np.ascontiguousarray(pixels[..., :3])
 
     def ignore(self, feature: str) -> None:
         """Note that a feature is ignored, which changes neither the shape nor the base color."""
@@ -291,12 +285,6 @@ def beside_textures(
     return np.where(is_textured[:, None, None], 1.0, colors)
 
 
-def product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Multiply the linear values of sRGB-encoded colors, and encode the product."""
-    factors = [decode(torch.from_numpy(colors), "srgb") for colors in (first, second)]
-    return encode(factors[0] * factors[1], "srgb").numpy()
-
-
 # Axes that remain if a polygon is projected along the axis x, y or z. A
 # polygon that is counter-clockwise seen from the positive axis stays so.
 _REMAINING_AXES = np.array([[1, 2], [2, 0], [0, 1]])
@@ -327,9 +315,8 @@ def triangulate(
         return triangles, polygons, 0
     # Corners in the plane of their polygon, in which it is counter-clockwise, shape (C, 2).
     points = _projected(corners, starts, sizes)
-    # A fan of counter-clockwise triangles covers the polygon.
+    # A fan of counter-clockwise triangles covers the polygon. A triangle always is such a fan.
     is_fan = np.minimum.reduceat(_doubled_areas(points, triangles), first_triangles) >= 0
-    is_fan |= sizes == 3
     parts = [triangles[is_fan[polygons]]]
     owners = [polygons[is_fan[polygons]]]
     crossing_count = 0

@@ -3,10 +3,9 @@
 import json
 import math
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from renderer.errors import InputError
 from renderer.image import decode
 from renderer.io.files import atomic_write
 from renderer.io.gltf import read_gltf
+from renderer.io.gltf_file import SPECULAR
 from renderer.io.images import encode_image
 from renderer.io.mesh_file import MeshFile, Part
 from renderer.io.obj import read_obj
@@ -26,10 +26,9 @@ from renderer.io.ply_off_stl import read_off, read_ply, read_stl
 from renderer.mesh import Y_UP_TO_Z_UP, Mesh, by_material, concatenate, require_mesh, transformed
 from renderer.normals import normal_groups
 
-# Suffixes of glTF files.
-GLTF = ("glb", "gltf")
-# Readers of other files.
-READERS = {"obj": read_obj, "off": read_off, "ply": read_ply, "stl": read_stl}
+# Readers of mesh files by their suffixes.
+READERS = {".glb": read_gltf, ".gltf": read_gltf}
+READERS |= {".obj": read_obj, ".off": read_off, ".ply": read_ply, ".stl": read_stl}
 
 
 def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
@@ -102,7 +101,7 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
         raise InputError(f"{fault}: export the mesh again")
     if not mesh.face_areas().sum() > 0:
         raise InputError(f"the surface of {path} has the area 0: give faces with an area")
-    is_gltf = path.suffix.lower().lstrip(".") in GLTF
+    is_gltf = READERS[path.suffix.lower()] is read_gltf
     is_y_up = up == "y" or (up == "auto" and is_gltf)
     return transformed(mesh, Y_UP_TO_Z_UP) if is_y_up else mesh
 
@@ -110,32 +109,26 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
 def read_parts(path: Path, gloss: bool = False) -> list[Part]:
     """Read the parts of a mesh file, and warn once of what is ignored or assumed."""
     errors.require_file(path, "give the path of a mesh file")
-    read = _reader(path, gloss)
+    read = READERS.get(path.suffix.lower())
     if read is None:
-        known = ", ".join(sorted([*READERS, *GLTF]))
+        known = ", ".join(sorted(READERS))
         raise InputError(f"{path} is not of a mesh format that is read: convert it to {known}")
     with errors.reading(path, "cannot be read as a mesh"):
-        file = MeshFile(path)
+        file = MeshFile(path, gloss)
         parts = read(file)
     file.warn(stacklevel=3)
     return parts
 
 
-def _reader(path: Path, gloss: bool) -> Callable[[MeshFile], list[Part]] | None:
-    """Return the function that reads mesh files of a suffix. None for other files."""
-    suffix = path.suffix.lower().lstrip(".")
-    return partial(read_gltf, gloss=gloss) if suffix in GLTF else READERS.get(suffix)
-
-
 def files_beside(path: Path) -> list[Path]:
     """List the materials, textures and buffers that a mesh file names, and that exist."""
-    readers = [read for gloss in (True, False) if (read := _reader(path, gloss))]
-    if not readers:
+    read = READERS.get(path.suffix.lower())
+    if read is None:
         return []
-    file = MeshFile(path)
     # A reader notes each file that it opens in `beside`. `load_mesh` raises the error of a mesh
     # that cannot be read. Some materials can only be read without gloss.
-    for read in readers:
+    for gloss in (True, False):
+        file = MeshFile(path, gloss)
         with suppress(Exception):
             read(file)
             break
@@ -145,7 +138,6 @@ def files_beside(path: Path) -> list[Path]:
 # Types of the numbers and kinds of the rows of arrays in glTF (3.6.2.2).
 _TYPES = {"float32": 5126, "uint32": 5125}
 _KINDS = {1: "SCALAR", 2: "VEC2", 3: "VEC3"}
-SPECULAR = "KHR_materials_specular"
 
 
 def export_mesh(

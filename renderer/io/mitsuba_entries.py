@@ -74,11 +74,11 @@ def sensor(
     return {**lens, "to_world": pose, "film": film}
 
 
-def sensor_of(camera: Camera, size: Size, pixel_format: str = "rgba") -> Scene:
+def sensor_of(camera: Camera, size: Size) -> Scene:
     """Convert a camera of this renderer to a camera of Mitsuba."""
     if not isinstance(camera, PerspectiveCamera):
         pose = pose_of(camera, camera.width / 2)
-        return sensor(pose, size, {"type": "orthographic"}, pixel_format)
+        return sensor(pose, size, {"type": "orthographic"})
     lens: Scene = {"type": "perspective", "fov": camera.angle}
     # By default, Mitsuba shows nothing nearer than 0.01 or farther than 10,000 units.
     lens |= {"near_clip": min(0.01, camera.near), "far_clip": max(1e4, camera.far)}
@@ -89,7 +89,7 @@ def sensor_of(camera: Camera, size: Size, pixel_format: str = "rgba") -> Scene:
         height, width = height_and_width(size)
         lens["principal_point_offset_x"] = -camera.principal_right / 2
         lens["principal_point_offset_y"] = camera.principal_up / 2 * (width / height)
-    return sensor(pose_of(camera), size, lens, pixel_format, camera.pixel_aspect)
+    return sensor(pose_of(camera), size, lens, pixel_aspect=camera.pixel_aspect)
 
 
 def pose_of(camera: Camera, scale: float = 1.0) -> Pose:

@@ -2,12 +2,13 @@
 
 import re
 from contextlib import suppress
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from renderer.image import encode
+from renderer.image import decode, encode
 from renderer.io import mesh_file
 from renderer.io.mesh_file import MeshFile, Part
 from renderer.mesh import NO_TEXTURE
@@ -96,13 +97,14 @@ def read_obj(file: MeshFile) -> list[Part]:
     if vertex_colors is not None:
         is_textured = texture_ids != NO_TEXTURE
         used_colors = mesh_file.beside_textures(vertex_colors[faces], is_textured, file)
-        colors = mesh_file.product(colors, used_colors)
+        first, second = (decode(torch.from_numpy(c), "srgb") for c in (colors, used_colors))
+        colors = encode(first * second, "srgb").numpy()
     # The row at the end is for corners without texture coordinates, whose index is -1.
     corner_uvs = np.append(uvs[:, :2], [[np.nan] * 2], axis=0)[uv_ids]
     texels = [file.texture(*texture) for texture in textures]
     mesh = mesh_file.colored_mesh(vertices, faces, colors, corner_uvs, texture_ids, texels)
     normals = np.append(normals, [[0.0] * 3], axis=0)
-    return [Part(mesh, normals[normal_ids] if len(normals) > 1 else None)]
+    return [Part(mesh, normals[normal_ids])]
 
 
 def _cleaned(text: bytes) -> bytes:
@@ -167,9 +169,7 @@ def _polygons(lines: dict[str, _Lines]) -> tuple[np.ndarray, np.ndarray]:
 
 def _corners(words: list[bytes]) -> np.ndarray:
     """Parse corners such as 1/2/3 or 1//3 as rows of three, with `_LEFT_OUT` for no index."""
-    if not words:
-        return np.zeros((0, 3), dtype=np.int64)
-    text = b" ".join(words) + b" "
+    text = b" ".join([*words, b""])
     # Write a number for each index that is left out, so that all corners read alike.
     absent = b"/%d" % _LEFT_OUT
     text = text.replace(b"//", absent + b"/").replace(b"/ ", absent + b" ")
@@ -183,7 +183,7 @@ def _corners(words: list[bytes]) -> np.ndarray:
     # Place of each number in its corner: 0 for v, 1 for vt and 2 for vn.
     columns = np.arange(len(is_last)) - firsts[corners]
     numbers = mesh_file.parse_numbers(text.replace(b"/", b" "), np.int64)
-    if columns.max() > 2 or len(numbers) != len(columns):
+    if columns.max(initial=0) > 2 or len(numbers) != len(columns):
         raise ValueError("a corner of a face is not like 1, 1/2, 1//3 or 1/2/3")
     table = np.full((len(words), 3), _LEFT_OUT)
     table[corners, columns] = numbers
@@ -191,17 +191,17 @@ def _corners(words: list[bytes]) -> np.ndarray:
 
 
 def _materials(lines: dict[str, _Lines], file: MeshFile) -> tuple[list[_Material], np.ndarray]:
-    """Read the used materials, a white one first, and find the index of the one of each face."""
+    """Read the used materials, and find the index of the one of each face."""
     library = _library(lines["mtllib"].names(), file)
-    # Name of the material of each line "usemtl", after None for faces before these lines. Blender
+    # A material may be used by many lines.
+    read = cache(lambda name: _material(name, library, file) if name else _Material())
+    # Name of the material of each line "usemtl", after "" for faces before these lines. Blender
     # writes a line without a name for faces without a material.
-    names = [None, *(name or None for name in lines["usemtl"].names())]
+    names = ["", *lines["usemtl"].names()]
     # Each face has the material of the last line "usemtl" before it.
-    choice_of_face = np.searchsorted(lines["usemtl"].numbers, lines["f"].numbers)
-    used = list(dict.fromkeys([None, *(names[choice] for choice in np.unique(choice_of_face))]))
-    materials = [_Material() if name is None else _material(name, library, file) for name in used]
-    ids = [used.index(name) if name in used else 0 for name in names]
-    return materials, np.array(ids)[choice_of_face]
+    line_of_face = np.searchsorted(lines["usemtl"].numbers, lines["f"].numbers)
+    used_lines, material_of_face = np.unique(line_of_face, return_inverse=True)
+    return [read(names[line]) for line in used_lines], material_of_face
 
 
 def _library(names: list[str], file: MeshFile) -> dict[str, _Definition] | None:

@@ -93,7 +93,7 @@ def _parts(file: MeshFile, elements: dict[str, _Values], texture_names: list[str
     textures = [file.texture(name) for name in texture_names[:1]]
     uvs = corner_uvs[corners]
     mesh = mesh_file.colored_mesh(vertices, triangles, colors, uvs, textures=textures)
-    return [Part(mesh, None if normals is None else normals[triangles])]
+    return [Part(mesh, np.zeros((*triangles.shape, 3)) if normals is None else normals[triangles])]
 
 
 def _columns(values: _Values, names: tuple[str, ...]) -> np.ndarray | None:
@@ -320,8 +320,6 @@ def read_stl(file: MeshFile) -> list[Part]:
         coordinates = faces["corners"].astype(np.float64)
     if has_colors:
         raise ValueError("colors in .stl files are not supported: export the mesh as .ply")
-    if not face_count:
-        return []
     mesh_file.require_bounded(coordinates=coordinates)
     corners = coordinates.reshape(-1, 3, 3)
     # Arrays that a program has not filled end with facets of zeros.
@@ -330,4 +328,5 @@ def read_stl(file: MeshFile) -> list[Part]:
         return []
     # Files have no shared vertices: each face has three of its own.
     vertex_ids = np.arange(len(vertices)).reshape(-1, 3)
-    return [Part(mesh_file.colored_mesh(vertices, vertex_ids, np.ones((1, 3))))]
+    mesh = mesh_file.colored_mesh(vertices, vertex_ids, np.ones((1, 3)))
+    return [Part(mesh, np.zeros_like(mesh.vertices).reshape(-1, 3, 3))]

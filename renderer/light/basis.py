@@ -153,12 +153,10 @@ class Harmonics(Basis):
 
         Column k is for a coefficient of 1 of the harmonic `nonzero[k]`.
         """
-        factors = harmonics.lambertian_factors(self.degree)[self.nonzero].to(normals)
-        values = harmonics.evaluate_harmonics(unit(normals.double().T), self.nonzero.tolist())
         # One row for each of K harmonics. Transposing at the end is faster than filling
         # columns.
-        irradiance = torch.stack(values).to(normals.dtype) * factors[:, None]
-        return irradiance.T.contiguous()
+        _, irradiance = harmonics.diffuse_basis(unit(normals.double().T), self.degree)
+        return irradiance.T.to(normals.dtype).contiguous()
 
     def radiance(self, directions: Float[Tensor, "N 3"]) -> Float[Tensor, "N size"]:
         """Compute the radiance of each harmonic from N directions."""

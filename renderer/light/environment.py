@@ -17,6 +17,7 @@ import errno
 import math
 import warnings
 from collections.abc import Sequence
+from itertools import takewhile
 from pathlib import Path
 from types import ModuleType
 
@@ -153,24 +154,18 @@ def write_map(path: str | Path, radiance: Float[Tensor, "H W 3"]) -> None:
     """
     path = Path(path)
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
-        raise InputError(f"{path} has an unknown suffix: use one of {', '.join(SUFFIXES)}")
     radiance = radiance.detach().cpu().float()
     path.parent.mkdir(parents=True, exist_ok=True)
     if suffix == ".npy":
         write_numbers(path, radiance.numpy())
-    elif suffix == ".hdr":
-        _write_image(path, _to_rgbe_precision(radiance), "hdr")
-    else:
-        _write_image(path, radiance, "openexr")
-
-
-def _write_image(path: Path, texels: Float[Tensor, "H W 3"], file_format: str) -> None:
-    """Write a temporary file and rename it, so that a reader never sees a part of an image."""
-    image = _openimageio().ImageBuf(texels.contiguous().numpy())
+        return
+    if suffix == ".hdr":
+        radiance = _to_rgbe_precision(radiance)
+    image = _openimageio().ImageBuf(radiance.contiguous().numpy())
+    # A reader never sees a part of the new file.
     with replacing(path) as temporary:
         # The data type "unknown" keeps the float32 values of the image.
-        if not image.write(str(temporary), "unknown", file_format):
+        if not image.write(str(temporary), "unknown", suffix[1:]):
             raise OSError(errno.EIO, " ".join(image.geterror().split()), str(path))
 
 
@@ -217,10 +212,8 @@ def _radiance_header(path: Path) -> tuple[np.ndarray, Sequence[float]]:
     factors = np.ones(3)
     chromaticities: Sequence[float] = REC_709
     with path.open("rb") as file:
-        for line in iter(file.readline, b""):
-            # An empty line ends the header.
-            if not line.strip():
-                break
+        # An empty line ends the header.
+        for line in takewhile(bytes.strip, file):
             key, _, value = line.decode("latin-1").partition("=")
             if key in ("EXPOSURE", "COLORCORR"):
                 # One number is broadcast to three channels, and two raise an error.

@@ -212,10 +212,8 @@ def probe(name: str) -> Float[Tensor, "49 3"]:
     to 6 are 0.
     """
     published = torch.tensor(_PUBLISHED_PROBES[name], dtype=torch.float64)
-    coefficients = torch.zeros(COEFFICIENTS, 3)
     z_up = harmonics.rotate(published, torch.from_numpy(Y_UP_TO_Z_UP[:3, :3])).float()
-    coefficients[: len(published)] = z_up
-    return coefficients
+    return F.pad(z_up, (0, 0, 0, COEFFICIENTS - len(z_up)))
 
 
 def ambient(color: Float[Tensor, " 3"]) -> Float[Tensor, "49 3"]:
@@ -223,9 +221,7 @@ def ambient(color: Float[Tensor, " 3"]) -> Float[Tensor, "49 3"]:
 
     The irradiance of a surface in this light is π times the radiance.
     """
-    coefficients = torch.zeros(COEFFICIENTS, 3, dtype=color.dtype)
-    coefficients[0] = math.sqrt(4 * math.pi) * color
-    return coefficients
+    return F.pad(math.sqrt(4 * math.pi) * color[None], (0, 0, 0, COEFFICIENTS - 1))
 
 
 def directional(
@@ -257,10 +253,9 @@ def perturb(
     # Axes: light, coefficient, color.
     offsets = (torch.rand(count, *light.shape, generator=generator) * 2 - 1) * amplitude
     if radius is not None:
-        diffuse_indices = harmonics.nonzero_coefficients(harmonics.degree_of(light))
-        # 1 for coefficients that change the irradiance of a surface, 0 for the others.
-        mask = torch.zeros(len(light), 1).index_fill_(0, diffuse_indices, 1.0)
-        offsets = offsets * mask
+        # True for coefficients that change the irradiance of a surface.
+        is_diffuse = harmonics.lambertian_factors(harmonics.degree_of(light)) != 0
+        offsets = offsets * is_diffuse[:, None]
         norms = offsets.flatten(1).norm(dim=1).clamp(min=1e-12)
         offsets = offsets * (radius / norms)[:, None, None]
     return light + offsets.to(light)

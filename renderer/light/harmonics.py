@@ -72,8 +72,7 @@ def degree_of(light: Float[Tensor, "coefficients 3"]) -> int:
         InputError: If no degree has this number of coefficients.
     """
     light = as_tensor("light", light)
-    if light.shape[-1:] != (3,):
-        require_shape("light", light, "(degree + 1)²", 3)
+    require_shape("light", light, "(degree + 1)²", 3)
     return _degree_of_rows("light", light)
 
 
@@ -146,8 +145,7 @@ def evaluate_harmonics(directions: Tensor, indices: Iterable[int]) -> list[Tenso
     real_power = torch.ones_like(z)
     imaginary_power = torch.zeros_like(z)
     for m in range(degree + 1):
-        bands_and_functions = zip(range(m, degree + 1), _legendre(z, m, degree), strict=True)
-        for l, legendre in bands_and_functions:
+        for l, legendre in enumerate(_legendre(z, m, degree), start=m):
             # Index of the harmonic of order 0 in band l.
             order_zero = l * l + l
             if order_zero + m in unique_indices:
@@ -367,6 +365,13 @@ def nonzero_coefficients(degree: int) -> Int[Tensor, " K"]:
         Ascending indices, int64, shape (K,).
     """
     return torch.nonzero(lambertian_factors(degree)).squeeze(1)
+
+
+def diffuse_basis(directions: Float[Tensor, "3 N"], degree: int) -> tuple[list[int], Tensor]:
+    """Compute the ascending indices of the M harmonics that count, and their irradiance (M, N)."""
+    nonzero = nonzero_coefficients(degree).tolist()
+    factors = lambertian_factors(degree).to(directions)[nonzero, None]
+    return nonzero, torch.stack(evaluate_harmonics(directions, nonzero)) * factors
 
 
 def irradiance_error(

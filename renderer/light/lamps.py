@@ -126,9 +126,9 @@ class Projector(Settings, LocalBasis):
         row, column = places.floor()
         # Cosine between path and normal, divided by the cosine between path and axis.
         cosine_ratio = ((source - points) * normals).sum(1) / depth
-        in_rows = (row >= 0) & (row < self.pixels)
-        in_columns = (column >= 0) & (column < self.pixels)
-        is_lit = in_rows & in_columns & (depth > 0) & (cosine_ratio > 0)
+        # Whether the row and the column are within the pattern.
+        is_within = (places >= 0) & (places < self.pixels)
+        is_lit = is_within[0] & is_within[1] & (depth > 0) & (cosine_ratio > 0)
         lit_point = torch.nonzero(is_lit).squeeze(1)
         irradiance = cosine_ratio * (self.distance / depth) ** 2
         pattern_pixel = (row * self.pixels + column)[lit_point].long()

@@ -165,7 +165,7 @@ def _project_channel(channel: bytes) -> Array:
     windowed = nonnegative_window(degree).numpy() * light
     # Harmonics in the directions in which the radiance must not be negative, one row
     # for each direction.
-    constraints = _grid(degree, _COARSE_SUBDIVISIONS).harmonics.T
+    constraints = _grid(degree, _COARSE_SUBDIVISIONS)[1].T
     for _ in range(_MAX_ROUNDS):
         _, new_constraints = _find_negative_minima(nearest[None], rounding_radiance, _LOWEST_STARTS)
         if not len(new_constraints):
@@ -260,6 +260,7 @@ def _split_channels(*coefficients: Float[Tensor, "... K C"]) -> Array:
     return rows[:, :, None].cpu().double().numpy()
 
 
+@dataclass(eq=False)
 class _QuadraticProgram:
     """Quadratic program for the non-negative light that is nearest to a light of C channels.
 
@@ -274,36 +275,31 @@ class _QuadraticProgram:
     distance of each coefficient.
     """
 
-    def __init__(
-        self,
-        original: Array,
-        low: Array | float = -np.inf,
-        high: Array | float = np.inf,
-        center: Array | float = 0.0,
-        radius: float = np.inf,
-        weights: Array | float = 1.0,
-    ):
+    original: Array
+    low: Array | float = -np.inf
+    high: Array | float = np.inf
+    center: Array | float = 0.0
+    radius: float = np.inf
+    weights: Array | float = 1.0
+
+    def __post_init__(self) -> None:
         """Solve the program without constraints on the radiance, within the bounds or the ball."""
-        self.original = original
-        self._center = center
-        self._radius = radius
-        self._weights = weights
-        self._offset = original - center
-        self._low = np.broadcast_to(low, original.shape)
-        self._high = np.broadcast_to(high, original.shape)
+        self._offset = self.original - self.center
+        self._low = np.broadcast_to(self.low, self.original.shape)
+        self._high = np.broadcast_to(self.high, self.original.shape)
         distance = float(np.linalg.norm(self._offset))
         # With this t, the point c + t (v - c) lies on the surface of the ball. Constraints
         # only move the solution closer to the center c, so a smaller t is never needed.
-        self._min_t = min(radius / max(distance, _TINY), 1.0)
+        self._min_t = min(self.radius / max(distance, _TINY), 1.0)
         self._t = self._min_t
-        self.nearest = self._unconstrained_point().clip(low, high)
+        self.nearest = self._unconstrained_point().clip(self.low, self.high)
         # Harmonics in the M directions whose constraint is active (its multiplier is positive),
         # one array (M, K) for each channel. At first, there are no directions.
-        self._active_constraints = [original[:0]] * len(original)
+        self._active_constraints = [self.original[:0]] * len(self.original)
 
     def _unconstrained_point(self) -> Array:
         """Compute the point c + t (v - c), whose projection is the solution, shape (C, K)."""
-        return self.original if self._t == 1 else self._center + self._t * self._offset
+        return self.original if self._t == 1 else self.center + self._t * self._offset
 
     def add_constraints(self, new_harmonics: Sequence[Array]) -> None:
         """Constrain the radiance in additional directions, and solve the program again.
@@ -320,14 +316,14 @@ class _QuadraticProgram:
         for _ in range(_MAX_RADIUS_STEPS):
             target = self._unconstrained_point()
             channels = zip(target, constraints, self._low, self._high, strict=True)
-            solutions = [_nearest(*channel, self._weights) for channel in channels]
+            solutions = [_nearest(*channel, self.weights) for channel in channels]
             nearest = np.stack([solution for solution, _ in solutions])
             self._active_constraints = [active for _, active in solutions]
-            displacement = nearest - self._center
+            displacement = nearest - self.center
             distance = float(np.linalg.norm(displacement))
-            missing = self._radius - distance
+            missing = self.radius - distance
             is_inside = self._t == 1 and missing > 0
-            is_on_sphere = abs(missing) <= _RADIUS_TOLERANCE * self._radius
+            is_on_sphere = abs(missing) <= _RADIUS_TOLERANCE * self.radius
             if is_inside or is_on_sphere:
                 break
             arrays = zip(self._offset, nearest - target, self._active_constraints, strict=True)
@@ -336,7 +332,7 @@ class _QuadraticProgram:
             velocity = np.stack(velocities)
             # The change s of t with |x - c + s velocity| = r solves the quadratic equation
             # s² |velocity|² + 2 s slope = r² - |x - c|² = (r - |x - c|) (r + |x - c|).
-            missing_squared = missing * (self._radius + distance)
+            missing_squared = missing * (self.radius + distance)
             squared_speed = float((velocity * velocity).sum())
             slope = float((velocity * displacement).sum())
             root = math.sqrt(max(slope**2 + squared_speed * missing_squared, 0))
@@ -351,8 +347,8 @@ class _QuadraticProgram:
                 displacement = displacement + step * velocity
                 break
         # Rounding may leave the solution slightly outside of the ball.
-        scale = min(1, self._radius / max(float(np.linalg.norm(displacement)), _TINY))
-        self.nearest = self._center + displacement * scale
+        scale = min(1, self.radius / max(float(np.linalg.norm(displacement)), _TINY))
+        self.nearest = self.center + displacement * scale
 
 
 def _differentiate(offset: Array, correction: Array, active_rows: Array) -> tuple[Array, ...]:
@@ -408,14 +404,15 @@ def _find_negative_minima(
     """
     degree = math.isqrt(lights.shape[1]) - 1
     is_coarse = degree <= _COARSE_GRID_DEGREE
-    grid = _grid(degree, _COARSE_SUBDIVISIONS if is_coarse else _FINE_SUBDIVISIONS)
+    subdivisions = _COARSE_SUBDIVISIONS if is_coarse else _FINE_SUBDIVISIONS
+    grid_directions, grid_harmonics, grid_neighbors = _grid(degree, subdivisions)
     # Radiance of each light (rows) in each direction of the grid (columns).
-    radiance = lights @ grid.harmonics
+    radiance = lights @ grid_harmonics
     largest = np.abs(radiance).max(1)
     upper_limit = np.where(largest > rounding_radiance, _ABOVE_ZERO * largest, -np.inf)
     light_index, grid_index = np.nonzero(radiance < upper_limit[:, None])
-    # Each of the six rows of `grid.neighbors` has one neighbor of every grid direction.
-    for neighbors in grid.neighbors:
+    # Each of the six rows of `grid_neighbors` has one neighbor of every grid direction.
+    for neighbors in grid_neighbors:
         neighbor_radiance = radiance[light_index, neighbors[grid_index]]
         margin = above_neighbors * largest[light_index]
         is_low = radiance[light_index, grid_index] <= neighbor_radiance + margin
@@ -424,7 +421,7 @@ def _find_negative_minima(
     # SH coefficients of the 3 first and the 9 second derivatives of the light of each start
     # direction. Axes: start, derivative, coefficient.
     derivatives = (lights @ _derivatives(degree)).reshape(len(lights), 3 + 9, -1)[light_index]
-    directions = grid.directions[grid_index]
+    directions = grid_directions[grid_index]
     for _ in range(_NEWTON_STEPS):
         directions = _step_down(directions, derivatives)
     harmonics = _harmonics(directions, degree)
@@ -512,25 +509,14 @@ def _derivatives(degree: int) -> Array:
     return torch.cat([first, second]).flatten(0, 1).T.contiguous().numpy()
 
 
-@dataclass(frozen=True)
-class _Grid:
-    """Grid of N directions, the vertices of an icosphere.
-
-    Attributes:
-        directions: Unit vectors, shape (N, 3).
-        harmonics: K harmonics in each direction, shape (K, N).
-        neighbors: Indices of the six neighbors of each direction, shape (6, N).
-            Twelve directions have only five neighbors. One of these occurs twice.
-    """
-
-    directions: Array
-    harmonics: Array
-    neighbors: Array
-
-
 @cache_tensors
-def _grid(degree: int, subdivisions: int) -> _Grid:
-    """Create the grid of directions in which negative radiance is searched."""
+def _grid(degree: int, subdivisions: int) -> tuple[Array, Array, Array]:
+    """Create the grid of N directions in which negative radiance is searched.
+
+    They are the vertices of an icosphere. The results are unit vectors, shape (N, 3), the K
+    harmonics in each direction, shape (K, N), and the indices of the six neighbors of each
+    direction, shape (6, N). Twelve directions have only five. One of these occurs twice.
+    """
     # trimesh is imported here because the import takes half a second.
     from trimesh.creation import icosphere
 
@@ -539,4 +525,4 @@ def _grid(degree: int, subdivisions: int) -> _Grid:
     neighbors = [[*around, *around[:1]][:6] for around in sphere.vertex_neighbors]
     directions = np.array(sphere.vertices)
     harmonics = np.ascontiguousarray(_harmonics(directions, degree).T)
-    return _Grid(directions, harmonics, np.array(neighbors).T)
+    return directions, harmonics, np.array(neighbors).T

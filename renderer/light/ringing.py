@@ -93,8 +93,6 @@ def best_window(
     light, and the first is 1.
     """
     degree = len(weight) - 1
-    if degree == 0:
-        return torch.ones(1, dtype=torch.float64)
     odd_numbers = 2 * np.arange(degree + 1) + 1
     # The squared coefficients of a point source in band l add up to (2l + 1) / 4π. The constant
     # factor 4π does not matter.

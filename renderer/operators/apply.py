@@ -198,11 +198,10 @@ class TransferOperator:
         if isinstance(background, Tensor):
             background = background.detach()
         prepared = self._prepare_background(background, lights)
-        images, is_unclamped, clamped_values = self._images(lights, prepared)
+        images, covered = self._images(lights, prepared)
         image_gradient = loss_gradient(images)
         require_image_gradient(image_gradient, images)
-        gradient = self._gradient_of_images(image_gradient.detach(), is_unclamped, clamped_values)
-        return images, gradient
+        return images, self._gradient_of_images(image_gradient.detach(), covered)
 
     def radiance(
         self, lights: Float[Tensor, "*lights coefficients 3"]
@@ -252,11 +251,11 @@ class TransferOperator:
 
     def _images(
         self, lights: Lights, background: tuple[Tensor, Tensor]
-    ) -> tuple[Tensor, Tensor, Tensor]:
+    ) -> tuple[Tensor, tuple[PixelValues, PixelValues]]:
         """Render images without autograd, and return what the gradient needs.
 
-        It returns the images, 1 for values of the covered pixels that clamping left alone
-        and 0 for others, and the clamped linear values of the covered pixels.
+        These are two values for each covered pixel: 1 if clamping left its value alone and 0 if
+        not, and the clamped linear value.
         """
         background_images, background_values = background
         unclamped = self._radiance(lights).add_(background_values)
@@ -271,15 +270,13 @@ class TransferOperator:
         # `scatter_` takes half the time of `index_copy_` on a CPU.
         images.scatter_(-1, self.pixels.expand(*batch_shape, COLORS, -1), encoded)
         image_shape = (*batch_shape, COLORS, *self.settings.shape)
-        return images.view(image_shape), is_unclamped, clamped_values
+        return images.view(image_shape), (is_unclamped, clamped_values)
 
     def _gradient_of_images(
-        self,
-        image_gradient: Float[Tensor, "... 3 height width"],
-        is_unclamped: PixelValues,
-        clamped_values: PixelValues,
+        self, image_gradient: Float[Tensor, "... 3 height width"], covered: tuple[Tensor, Tensor]
     ) -> Lights:
-        """Convert a gradient from images to lights, with the last two results of `_images`."""
+        """Convert a gradient from images to lights, with the second result of `_images`."""
+        is_unclamped, clamped_values = covered
         pixel_index = self.pixels.expand(is_unclamped.shape)
         # `gather` is faster than `index_select`, most of all for three axes.
         pixel_gradient = image_gradient.flatten(-2).gather(-1, pixel_index)
@@ -368,8 +365,8 @@ class TransferOperator:
         key = (background, lights.dtype, lights.device)
         is_kept = isinstance(background, float | int) and lights.ndim <= 2
         # Other threads may replace the pair meanwhile.
-        last_key, last = self._last_background.get("pair", (None, None))
-        if is_kept and last is not None and last_key == key:
+        last_key, last = vars(self).get("_last_background", (None, None))
+        if is_kept and last_key == key:
             return last
         images = as_background(background, self.settings.size, lights).flatten(-2)
         # Background of the P covered pixels. Only these mix with the mesh.
@@ -383,7 +380,7 @@ class TransferOperator:
         term = background_term(coverage, at_pixels, self.settings.encoding)
         prepared = (images, term)
         if is_kept:
-            self._last_background["pair"] = key, prepared
+            vars(self)["_last_background"] = key, prepared
         return prepared
 
     def to(self, device: torch.device | str) -> TransferOperator:
@@ -422,11 +419,6 @@ class TransferOperator:
         return list(self.transfer)
 
     @cached_property
-    def _last_background(self) -> dict[str, tuple[Any, tuple[Tensor, Tensor]]]:
-        """Key of the last gray background, and what was prepared for it ("pair")."""
-        return {}
-
-    @cached_property
     def _placement(self) -> Tensor:
         """Matrix that writes the K used coefficients among all others, which become exactly 0."""
         return torch.eye(self.basis.size).to(self.transfer)[:, self.nonzero]
@@ -444,12 +436,10 @@ class _Image(torch.autograd.Function):
         ctx: Any, lights: Lights, operator: TransferOperator, background: tuple[Tensor, Tensor]
     ) -> Float[Tensor, "... 3 height width"]:
         """Render one image under each light."""
-        images, is_unclamped, clamped_values = operator._images(lights, background)
+        images, ctx.covered = operator._images(lights, background)
         # `once_differentiable` looks for saved tensors.
         ctx.save_for_backward(lights)
         ctx.operator = operator
-        ctx.is_unclamped = is_unclamped
-        ctx.clamped_values = clamped_values
         return images
 
     @staticmethod
@@ -458,8 +448,7 @@ class _Image(torch.autograd.Function):
         ctx: Any, upstream: Float[Tensor, "... 3 height width"]
     ) -> tuple[Tensor, None, None]:
         """Compute the gradient with respect to the lights."""
-        gradient = ctx.operator._gradient_of_images(upstream, ctx.is_unclamped, ctx.clamped_values)
-        return gradient, None, None
+        return ctx.operator._gradient_of_images(upstream, ctx.covered), None, None
 
 
 def require_image_gradient(image_gradient: Tensor, images: Tensor) -> None:

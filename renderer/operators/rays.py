@@ -35,14 +35,7 @@ from renderer.mesh import Mesh
 from renderer.normals import face_normals
 from renderer.operators.apply import SparseTransfer
 from renderer.settings import ImageSettings
-from renderer.surface.gloss import (
-    IGNORED_PERCENT,
-    Gloss,
-    SampleGloss,
-    at_samples,
-    sample_gloss,
-    toward_camera,
-)
+from renderer.surface.gloss import Gloss, SampleGloss, at_samples, sample_gloss, toward_camera
 from renderer.surface.shading import normals_in_sight, smooth_normals
 from renderer.vectors import unit, unit_vectors
 from renderer.visibility.fragments import Fragments
@@ -161,16 +154,8 @@ class Surface:
 
     @property
     def lobe_width(self) -> float:
-        """Smallest width α = roughness² of the specular lobes. Infinite for a matte surface.
-
-        As in `smallest_roughness`, the 1% of the samples with the smallest roughness do not count.
-        """
-        if self.gloss is None:
-            return math.inf
-        roughness, *factors = torch.broadcast_tensors(*(values.detach() for values in self.gloss))
-        roughness = roughness[(factors[0] > 0) | (factors[1] > 0)]
-        rank = 1 + len(roughness) * IGNORED_PERCENT // 100
-        return float(roughness.kthvalue(rank).values) ** 2 if len(roughness) else math.inf
+        """Smallest width α of the specular lobes (`SampleGloss`). Infinite for a matte surface."""
+        return math.inf if self.gloss is None else self.gloss.lobe_width
 
     @cached_property
     def toward(self) -> Tensor:
@@ -241,8 +226,7 @@ class Rays:
         if not len(pixels):
             return
         normals, planes = surface.normals, surface.planes
-        above = surface.points + self.offset * planes
-        starts = (above - torch.from_numpy(self._mesh.origin)).float()
+        starts = surface.points + self.offset * planes
         sample_count, _ = surface.samples_of_pixels
         # The directions form turns, in each of which a pixel goes once through its samples. So
         # those in one place of all turns start at the same sample. Pixels with a rare number of
@@ -255,7 +239,6 @@ class Rays:
             # The last turn is filled up with zeros, which are blocked nowhere.
             in_turns = F.pad(directions, (0, 0, 0, turns * places - len(directions)))
             at_places = in_turns.view(turns, places, 3).transpose(0, 1)
-            float_directions = in_turns.float()
             group = pixels[places_of_pixel == places]
             for block in group.split(max(1, BLOCK // len(directions))):
                 sample = surface.samples_of_rays(block, places).T
@@ -268,7 +251,7 @@ class Rays:
                 cast = torch.nonzero(is_in_front & (height > 0) & may_hit[sample][:, None])
                 place, turn, row = cast.T
                 origins = starts[sample[place, row]]
-                face = self._first_hit(origins, float_directions[turn * places + place])
+                face = self.first_hit(origins, in_turns[turn * places + place])
                 is_hit = face != NO_FACE
                 below = torch.nonzero(is_in_front & (height < 0))
                 place, turn, row = torch.cat([cast[is_hit], below]).T
@@ -340,10 +323,7 @@ class Rays:
 
         Rays are infinite if `lengths` is None.
         """
-        return self._first_hit(origins - torch.from_numpy(self._mesh.origin), directions, lengths)
-
-    def _first_hit(self, *rays: Tensor | None) -> Int[Tensor, " N"]:
-        """Find the faces of `first_hit`, with origins of rays relative to that of the mesh."""
+        rays = [origins - torch.from_numpy(self._mesh.origin), directions, lengths]
         given = [each.numpy() for each in rays if each is not None]
         arrays = [np.ascontiguousarray(each, np.float32) for each in given]
         return torch.from_numpy(self._scene.run(*arrays)).long()

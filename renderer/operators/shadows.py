@@ -378,8 +378,7 @@ def _radiosity(
     sample_albedo = surface_albedo(patches.pieces, patches.view, settings.encoding)
     # Mean albedo: one row for each patch, one column for each color.
     patch_albedo = patches.mean(sample_albedo) * albedo_scale
-    has_colors = bool((patch_albedo != patch_albedo[:, :1]).any())
-    channel_count = 3 if has_colors else 1
+    channel_count = 3 if (patch_albedo != patch_albedo[:, :1]).any() else 1
     # Sent radiance per irradiance ρ_i / π. Axes: patch, one of size 1, color.
     reflectance = patch_albedo[:, None, :channel_count] / math.pi
     # Irradiance from the sky (N, K, 1), the patches that see others, and F (M, N) for these.

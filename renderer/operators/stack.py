@@ -63,15 +63,13 @@ class TransferOperators(Sequence[TransferOperator]):
                 the first one in settings, basis or dtype.
         """
         self._operators = list(operators)
-        if not self._operators:
+        kinds = {(each.settings, each.basis, each.transfer.dtype) for each in self._operators}
+        if not kinds:
             raise InputError("operators is empty: give at least one TransferOperator")
-        first = self._operators[0]
-        for operator in self._operators:
-            is_same = operator.settings == first.settings and operator.basis == first.basis
-            if not is_same or operator.transfer.dtype != first.transfer.dtype:
-                fault = "operators differ in image settings, basis of light or dtype"
-                advice = "compute all operators with the same settings, basis and dtype"
-                raise InputError(f"{fault}: {advice}")
+        if len(kinds) > 1:
+            fault = "operators differ in image settings, basis of light or dtype"
+            advice = "compute all operators with the same settings, basis and dtype"
+            raise InputError(f"{fault}: {advice}")
 
     @overload
     def __getitem__(self, index: int) -> TransferOperator: ...
@@ -390,8 +388,21 @@ class OperatorStack:
         shows_all_operators = len(operators) == len(self.transfer)
         transfer = self.transfer if shows_all_operators else self.transfer[operators]
         albedo = self.albedo if shows_all_operators else self.albedo[operators]
+        # The lights are the left factor of the matrix product, which is several times faster on a
+        # CPU. With three channels, each color has its own, which includes the albedo. A single
+        # channel is shared by all colors. A second one is specular reflection, which is added.
+        shared, *white = transfer.unbind(1)
+        if len(white) == 2:
+            # Multiply a matrix (slots, K) and a matrix (K, P) for each color.
+            radiance = (light_table.movedim(-1, -3) @ transfer).movedim(-3, -2)
+        else:
+            # One row for each pair of a light and a color, so that one matrix product computes all.
+            light_rows = light_table.mT.flatten(-3, -2)
+            radiance = (light_rows @ shared).unflatten(-2, (-1, COLORS)) * albedo.unsqueeze(-3)
+            if white:
+                radiance = radiance + (light_rows @ white[0]).unflatten(-2, (-1, COLORS))
         # Axes: cell of the table, color, pixel.
-        radiance = _apply_transfer(light_table, transfer, albedo).flatten(0, 1)
+        radiance = radiance.flatten(0, 1)
         if not is_ordered:
             radiance = radiance.index_select(0, cell)
         if any(len(entries.pixel) for entries in self._sparse):
@@ -415,27 +426,3 @@ class OperatorStack:
         zeros = contributions.new_zeros(len(lights) * pixel_count, COLORS)
         radiance = zeros.index_add(0, image_of_entry * pixel_count + entries.pixel, contributions)
         return radiance.unflatten(0, (len(lights), pixel_count)).mT
-
-
-def _apply_transfer(
-    lights: Float[Tensor, "O B K 3"],
-    transfer: Float[Tensor, "O C K P"],
-    albedo: Float[Tensor, "O 3 P"],
-) -> Float[Tensor, "O B 3 P"]:
-    """Compute the radiance of P pixels under B lights for each of O transfer matrices.
-
-    The lights are the left factor of the matrix product, which is several times
-    faster on a CPU. With three channels, each color has its own, and `albedo` is not used.
-    A single channel is shared by all colors, and multiplied by `albedo`. A second channel
-    is specular reflection, which is added.
-    """
-    shared, *white = transfer.unbind(1)
-    if len(white) == 2:
-        # Multiply a matrix (B, K) and a matrix (K, P) for each color.
-        return (lights.movedim(-1, -3) @ transfer).movedim(-3, -2)
-    # One row for each pair of a light and a color, so that one matrix product computes all.
-    light_rows = lights.mT.flatten(-3, -2)
-    radiance = (light_rows @ shared).unflatten(-2, (-1, COLORS)) * albedo.unsqueeze(-3)
-    if white:
-        radiance = radiance + (light_rows @ white[0]).unflatten(-2, (-1, COLORS))
-    return radiance

@@ -198,39 +198,35 @@ def paint_faces(
     """
     # Unlike `hue[faces]`, `index_select` adds up gradients in the same order for any number of
     # threads.
-    hue_of_face = None if hue is None else hue.index_select(0, fragments.faces)
+    given = [part for part in (added, hue) if part is not None]
+    change_of_face = [part.index_select(0, fragments.faces) for part in given]
     # First, change the colors of the corners of faces and interpolate them, as if no face
     # had a texture. The three corners of a face have the same hue and added color.
     corner_albedo = _corner_albedo(mesh, fragments, encoding, added) * albedo_scale
-    hue_at_corners = None if hue_of_face is None else hue_of_face[:, None]
-    added_at_corners = added.index_select(0, fragments.faces)[:, None]
-    painted_corners = changed_albedo(corner_albedo, hue_at_corners, added_at_corners)
-    albedo = fragments.interpolate(painted_corners)
+    change_at_corners = (part[:, None] for part in change_of_face)
+    albedo = fragments.interpolate(changed_albedo(corner_albedo, *change_at_corners))
     if not mesh.textures:
         return albedo
 
     # Then replace the albedo at samples of faces with a texture: change the texels of the
     # texture, and interpolate them.
     colors = (_interpolated_colors(mesh, fragments, encoding) * albedo_scale).to(added)
-    added_at_samples = face_albedo(added, fragments)
-    hue_at_samples = None
-    if hue_of_face is not None:
-        hue_at_samples = hue_of_face.index_select(0, fragments.sample_to_seen_face)
+    face = fragments.sample_to_seen_face
+    change_at_samples = [part.index_select(0, face) for part in change_of_face]
     textures = mesh_textures(mesh, encoding, added)
     for texture, samples, uvs in _samples_of_textures(textures, mesh, fragments):
-        hue_here = None if hue_at_samples is None else hue_at_samples.index_select(0, samples)
-        added_here = added_at_samples.index_select(0, samples)
+        change_here = [part.index_select(0, samples) for part in change_at_samples]
         weighted_texels = []
         for weight, texel in _surrounding_texels(texture, uvs):
             texel_albedo = colors[samples] * texture.look_up(texel).T
-            painted_texel = changed_albedo(texel_albedo, hue_here, added_here)
+            painted_texel = changed_albedo(texel_albedo, *change_here)
             weighted_texels.append(weight.to(added)[:, None] * painted_texel)
         albedo = albedo.index_copy(0, samples, reduce(torch.add, weighted_texels))
     return albedo
 
 
 def changed_albedo(
-    albedo: Float[Tensor, "... 3"], hue: Float[Tensor, " ..."] | None, added: Float[Tensor, "... 3"]
+    albedo: Float[Tensor, "... 3"], added: Tensor, hue: Float[Tensor, " ..."] | None = None
 ) -> Float[Tensor, "... 3"]:
     """Rotate the hue of an albedo, add a color, and clamp the sum.
 
@@ -339,9 +335,9 @@ def with_added_albedo(
 
     def paint(albedo: Float[Tensor, "N 3"], faces: Int[np.ndarray, " N"]) -> Tensor:
         """Change and encode the albedo at N points of faces."""
-        hue_at_points = None if hue is None else torch.from_numpy(hue[faces]).float()
-        added_at_points = torch.from_numpy(added[faces]).float()
-        changed = changed_albedo(albedo * albedo_scale, hue_at_points, added_at_points)
+        given = [part[faces] for part in (added, hue) if part is not None]
+        change = (torch.from_numpy(part).float() for part in given)
+        changed = changed_albedo(albedo * albedo_scale, *change)
         return encode((changed / new_scale).clamp(max=1), encoding)
 
     even = [texture.size and (texture == texture[:1, :1]).all() for texture in mesh.textures]

@@ -161,6 +161,17 @@ class SampleGloss(NamedTuple):
         """Return a copy in the dtype and on the device of another tensor."""
         return SampleGloss(*(values.to(like) for values in self))
 
+    @property
+    def lobe_width(self) -> float:
+        """Smallest width α = roughness² of the specular lobes. Infinite if no sample has one.
+
+        As in `smallest_roughness`, the 1% of the samples with the smallest roughness do not count.
+        """
+        roughness, *factors = torch.broadcast_tensors(*(values.detach() for values in self))
+        roughness = roughness[(factors[0] > 0) | (factors[1] > 0)]
+        rank = 1 + len(roughness) * IGNORED_PERCENT // 100
+        return float(roughness.kthvalue(rank).values) ** 2 if len(roughness) else math.inf
+
     def lobes(self, cosine: Float[Tensor, " S"], degree: int) -> tuple[Tensor | None, Tensor]:
         """Compute the specular lobes of S samples for environment light.
 

@@ -72,7 +72,7 @@ def radiance(
     require_bounded(albedo=albedo)
     # Float16 would lose too much precision.
     wide = torch.promote_types(vertices.dtype, torch.float32)
-    albedo = albedo.to(wide)
+    albedo, light = albedo.to(wide), light.to(wide)
     if normals is None:
         # All samples of a face in a pixel have the same irradiance. They are merged: the
         # weight of a pair of face and pixel is their mean albedo times their share of the
@@ -81,14 +81,14 @@ def radiance(
         pixel = fragments.groups.group_to_pixel
         face_normals = area_vectors(vertices, fragments.corners) * fragments.facing.T
         view = fragments.view_of_face if light.ndim > 2 else None
-        incoming = irradiance(face_normals, light, wide, view)
+        incoming = irradiance(face_normals, light, view)
         incoming = incoming.index_select(1, fragments.groups.group_to_seen_face)
     else:
         pixel = fragments.sample_to_pixel
         weights = albedo / fragments.samples**2
         shading_normals = smooth_normals(fragments, normals.to(wide))
         view = fragments.view_of_sample if light.ndim > 2 else None
-        incoming = irradiance(shading_normals.T, light, wide, view)
+        incoming = irradiance(shading_normals.T, light, view)
     reflected = incoming * weights.T
     # Each column of `reflected` is a pixel already if a pixel has one sample.
     if fragments.samples > 1:
@@ -228,7 +228,6 @@ class _HarmonicSum(torch.autograd.Function):
 def irradiance(
     normals: Float[Tensor, "3 N"],
     light: Float[Tensor, "*views coefficients 3"],
-    dtype: torch.dtype,
     view: Int[Tensor, " N"] | None = None,
 ) -> Float[Tensor, "3 N"]:
     """Compute the irradiance of environment light on surfaces with N normals.
@@ -240,7 +239,6 @@ def irradiance(
     exactly 0. If each view has its own light, `view` is the view of each normal, ascending.
     """
     require_bounded(light=light)
-    light = light.to(dtype)
     # `degree_of` raises InputError if K is not (degree + 1)².
     harmonics.degree_of(light[0] if view is not None else light)
     if view is None:
@@ -269,7 +267,8 @@ class _Irradiance(torch.autograd.Function):
             degree = math.isqrt(len(light)) - 1
             # The polynomial is the irradiance only for unit normals. For normals of length
             # 0, the harmonics are evaluated instead.
-            nonzero, irradiance_per_unit = _diffuse_basis(directions[:, zero_normals], degree)
+            zeros = directions[:, zero_normals]
+            nonzero, irradiance_per_unit = harmonics.diffuse_basis(zeros, degree)
             value[:, zero_normals] = light[nonzero].T @ irradiance_per_unit
         ctx.save_for_backward(directions, lengths, gradient if ctx.needs_input_grad[0] else None)
         ctx.light_shape = light.shape
@@ -297,7 +296,7 @@ class _Irradiance(torch.autograd.Function):
             degree = math.isqrt(ctx.light_shape[0]) - 1
             light_gradient = directions.new_zeros(ctx.light_shape)
             for block_directions, block_upstream in split_samples(directions, upstream):
-                nonzero, irradiance_per_unit = _diffuse_basis(block_directions, degree)
+                nonzero, irradiance_per_unit = harmonics.diffuse_basis(block_directions, degree)
                 light_gradient[nonzero] += irradiance_per_unit @ block_upstream.T
         return normal_gradient, light_gradient
 
@@ -380,13 +379,6 @@ def _gradients(degree: int) -> Tensor:
     in_monomials = harmonics.monomial_coefficients(degree - 1) @ in_harmonics
     has_same_parity = band % 2 == degree % 2
     return in_monomials * ((band > 0) & has_same_parity)
-
-
-def _diffuse_basis(directions: Float[Tensor, "3 N"], degree: int) -> tuple[list[int], Tensor]:
-    """Compute the ascending indices of the M harmonics that count, and their irradiance (M, N)."""
-    nonzero = harmonics.nonzero_coefficients(degree).tolist()
-    factors = harmonics.lambertian_factors(degree).to(directions)[nonzero, None]
-    return nonzero, torch.stack(harmonics.evaluate_harmonics(directions, nonzero)) * factors
 
 
 def normals_in_sight(

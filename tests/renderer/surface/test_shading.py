@@ -29,7 +29,7 @@ SPECIAL += [[0.0, -1.0, -0.0], [1e-9, 0.0, 1.0]]
 
 
 def irradiance(normals: Tensor, light: Tensor) -> Tensor:
-    return shading.irradiance(normals.T, light, light.dtype)
+    return shading.irradiance(normals.T, light)
 
 
 def some_normals(count: int) -> Tensor:

@@ -150,7 +150,7 @@ def test_a_material_stays_in_its_norm_ball_and_physical(norm, radius):
 def test_the_hue_turns_by_the_angle_and_keeps_the_mean(angle):
     """HSV's hue runs along a hexagon, which is off by at most 1.3° at both ends."""
     orange = torch.tensor([0.5, 0.4, 0.35], dtype=torch.float64)
-    turned = changed_albedo(orange, torch.tensor(float(angle)).double(), torch.zeros(3))
+    turned = changed_albedo(orange, torch.zeros(3), torch.tensor(float(angle)).double())
     assert turned.mean() == pytest.approx(float(orange.mean()))
     before = 360 * colorsys.rgb_to_hsv(*orange.tolist())[0]
     after = 360 * colorsys.rgb_to_hsv(*turned.tolist())[0]
