@@ -506,8 +506,8 @@ def _curve(matches: Matches) -> list[tuple[float, ...]]:
     """Return false detections per image and recall at descending thresholds."""
     every = np.ones((1, matches.image_count))
     # Objects that are never detected have the score -inf, which is no threshold.
-    finite = matches.object_score[np.isfinite(matches.object_score)]
-    thresholds = np.unique([*finite, *matches.score])[::-1]
+    scores = matches.objects.score
+    thresholds = np.unique([*scores[np.isfinite(scores)], *matches.detections.score])[::-1]
     measures = (matches.false_per_image, matches.recall)
     # CURVE_POINTS thresholds are enough for the plot.
     return [
