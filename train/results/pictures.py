@@ -218,12 +218,11 @@ def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:
 
 
 def encode_picture(image: Image.Image, alt: str, caption: str = "") -> Picture:
-    """Encode an image for a page: a small image as PNG, a larger one as JPEG."""
-    if max(image.size) <= SMALL:
-        content = encode_image(image, "PNG", optimize=True)
-        return Picture(content, "png", alt, image.width, caption)
-    content = encode_image(image.convert("RGB"), "JPEG", optimize=True, quality=82)
-    return Picture(content, "jpeg", alt, image.width, caption)
+    """Encode an RGB image for a page: a small image as PNG, a larger one as JPEG."""
+    kind = "png" if max(image.size) <= SMALL else "jpeg"
+    # The quality is that of JPEG.
+    content = encode_image(image, kind.upper(), optimize=True, quality=82)
+    return Picture(content, kind, alt, image.width, caption)
 
 
 def read_square(path: Path, side: int, alt: str, caption: str = "") -> Picture:
