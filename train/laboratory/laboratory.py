@@ -313,8 +313,7 @@ def _light_sources(shot: Shot) -> list[dict[str, Any]]:
     lights = []
     for position, pattern in zip(shot.projectors, shot.patterns, strict=True):
         distance = float(np.linalg.norm(position - shot.center))
-        half_angle = np.arctan(PROJECTOR_HALF_WIDTH / distance)
-        fov = 2 * float(np.degrees(half_angle))
+        fov = 2 * float(np.degrees(np.arctan(PROJECTOR_HALF_WIDTH / distance)))
         # The irradiance of a projector falls with the square of the distance.
         power = shot.brightness * distance**2
         pose = look_at(position, shot.center)

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, Num, Shaped
 
-from train.results.tables import Estimate, Proportion, fraction, wilson
+from train.results.tables import NORMAL_QUANTILE, Estimate, Proportion, fraction, wilson
 
 # False-positive rates at which the recall is reported. Decimal strings are exact,
 # while a float such as 0.1 is not.
@@ -245,8 +245,7 @@ def change_ends(one: Jackknife, other: Jackknife, is_paired: bool = True) -> np.
     if one.at_ends is not None and other.at_ends is not None:
         is_same &= (one.at_ends == other.at_ends).all(axis=0)
     # The upper end of Wilson's interval for 0 of `unit_count` units.
-    margin = fraction(0, one.unit_count).high
-    assert margin is not None
+    _, margin = wilson(0, one.unit_count, NORMAL_QUANTILE)
     return np.where(is_same, np.multiply.outer([-margin, margin], np.ones_like(value)), ends)
 
 
