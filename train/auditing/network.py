@@ -317,13 +317,10 @@ class AuditedNetwork:
 
         None if no view is recognized before the attacks.
         """
-        # The last count of misclassified views is that of the largest radius.
-        lost = {
-            kind: counts["adversarial"][-1] / counts["correct"]
-            for kind, counts in self.counts.items()
-            if counts["correct"]
-        }
-        return max(lost, key=lambda kind: lost[kind], default=None)
+        # The last fraction is that of the largest radius.
+        kept = {kind: self.remaining(kind, "adversarial")[-1].value for kind in self.counts}
+        known = {kind: value for kind, value in kept.items() if value is not None}
+        return min(known, key=lambda kind: known[kind], default=None)
 
     def remaining(self, kind: str, method: str) -> list[Proportion]:
         """Return the fraction of the views that stay correct, of those correct before, by radius.

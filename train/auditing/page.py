@@ -368,8 +368,7 @@ def detection_sections(networks: Mapping[str, Path], label: str) -> list[dict[st
             if (path / lights.BOXED / SUMMARY).exists():
                 by_label = read_json(path / lights.BOXED / SUMMARY)["by_label"]
                 tables.append(_metrics_table(by_label, f"photographs{end}", "class"))
-        points = {name: [[(x, y) for x, y in content["curve"]]]}
-        chart = plot_curves(points, "recall", "false detections per image")
+        chart = plot_curves({name: [content["curve"]]}, "recall", "false detections per image")
         # The curve of a detector that finds nothing is empty, like that of a segmenter.
         about = ABOUT if "recall" in content["metrics"]["plain light"] else ABOUT_PIXELS
         shown = {"tables": tables, "charts": [chart] if chart else []}

@@ -201,8 +201,7 @@ def compare_networks(
     sentences += [gain_sentence(text, gain) for text, gain in known.items() if gain is not None]
 
     images = f"{_describe_images(pool, labels)} The gains have {describe_intervals([auc])}."
-    trained = _classes_with_trained_objects(after[0].run, labels, folder)
-    if trained:
+    if trained := _classes_with_trained_objects(after[0].run, labels, folder):
         trained_labels = join_words(trained, "and")
         images += f" The images of {trained_labels} show the objects of the training in new light."
     note = f"For other objects, any answer but {label} counts as right. Shown are the images on "

@@ -326,8 +326,7 @@ def score(
     if by == "mesh" and not any(item.mesh for item in predicted.predictions.photograph):
         fault = f"by=mesh, but {predicted.folder} has no {TABLE} with a column mesh"
         raise InputError(f"{fault}: add this table, or remove by=mesh")
-    thresholds_by_label = {point.label: point.threshold for point in points}
-    pooled = Pooled(predicted.predictions, thresholds=thresholds_by_label)
+    pooled = Pooled(predicted.predictions, {point.label: point.threshold for point in points})
     return Scores(predicted, pooled, points, by)
 
 
