@@ -316,21 +316,18 @@ def class_means(
 def auc_and_recalls(
     positives: Num[np.ndarray, " n"],
     negatives: Num[np.ndarray, " m"],
-    positive_counts: Int[np.ndarray, "... n"] | None = None,
-    negative_counts: Int[np.ndarray, "... m"] | None = None,
+    *counts: Int[np.ndarray, "... _"],
 ) -> Float[np.ndarray, "4 ..."]:
     """Compute the AUC, and the recall at each false-positive rate in `RATES`.
 
     The AUC is the probability that a random positive has a higher score than a
     random negative. A tie counts half (Mann and Whitney 1947). The recall is the
     fraction of the positives that score above the threshold for a
-    false-positive rate. A positive at the threshold counts as missed. The counts say how often each
-    image counts. None counts each once.
+    false-positive rate. A positive at the threshold counts as missed. `counts` say how often each
+    positive and each negative counts, shapes (..., n) and (..., m). Without them, each counts once.
     """
-    if positive_counts is None:
-        positive_counts = np.ones(len(positives), int)
-    if negative_counts is None:
-        negative_counts = np.ones(len(negatives), int)
+    ones = (np.ones(len(scores), int) for scores in (positives, negatives))
+    positive_counts, negative_counts = counts or ones
     positive_total = positive_counts.sum(axis=-1)
 
     order = negatives.argsort()
