@@ -42,7 +42,7 @@ ORIGINAL = "the original network"
 LIGHT_ALONE = "normalized light"
 HARDENING = "hardening"
 BOTH = "hardening and normalized light"
-# What a user does for each remedy.
+# What a user does for each remedy, from the cheapest to the most expensive.
 CHECK = "Choose its threshold and check it on your own photographs first."
 ADVICE = {
     ORIGINAL: "Keep the original network.",
@@ -396,8 +396,7 @@ def name_remedies(networks: Mapping[str, Classifier]) -> dict[str, str]:
         name = HARDENING if network.normalized_light is None else BOTH
         name = name if key.startswith(HARDENED) else LIGHT_ALONE
         subfolders[ORIGINAL if key == CLASSIFIER else name] = key
-    order = (ORIGINAL, LIGHT_ALONE, HARDENING, BOTH)
-    return {name: subfolders[name] for name in order if name in subfolders}
+    return {name: subfolders[name] for name in ADVICE if name in subfolders}
 
 
 def recommend(evaluations: Evaluations) -> Recommendation | None:
