@@ -64,8 +64,6 @@ NEXT_TRAINING = (
     "First, train the network on these objects in natural light: most of the gain of hardening "
     "comes from seeing the objects at all."
 )
-# Remedies are compared by top-1 accuracy if there are several positive classes.
-TOP1 = "class_top1"
 
 
 @dataclass(frozen=True)
@@ -410,7 +408,7 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
     """
     original, *remedies = evaluations
     positives = evaluations[original][0].pooled.all.positives
-    metric = TOP1 if len(positives.labels) > 1 else EQUAL_RATE
+    metric = "class_top1" if len(positives.labels) > 1 else EQUAL_RATE
 
     def gain_over(name: str, reference: str) -> Difference | None:
         return difference(evaluations[name], evaluations[reference], ALL, metric)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from train.auditing import lights
 from train.auditing import network as audited
-from train.auditing.lights import ADDITIONAL_STEPS, KINDS, NORMALIZED, SIDE, STEPS, VIEWS
+from train.auditing.lights import ADDITIONAL_STEPS, KINDS, NORMALIZED, SIDE, STEPS
 from train.auditing.network import IN_WORDS, AuditedNetwork, AuditReport, Recommendation
 from train.auditing.relit import relit_sections, screen_of_photographs
 from train.results import compare, first_screen
@@ -360,7 +360,7 @@ def detection_sections(networks: Mapping[str, Path], label: str) -> list[dict[st
         if not (folder / lights.DETECTED).exists():
             continue
         content = read_json(folder / lights.DETECTED)
-        title = f"renders; 95% intervals over {VIEWS}"
+        title = "renders; 95% intervals over views"
         tables = [_metrics_table(content["metrics"], title, "light")]
         # The same network with the remedy "normalized light", which may have scores, too.
         normalized = folder.with_name(f"{folder.name}{NORMALIZED}")

@@ -16,8 +16,6 @@ from augment.settings import NO_CLASS_PIXEL
 from train.results.intervals import Units, leave_out
 from train.results.tables import Estimate
 
-# What the intervals are over.
-PHOTOGRAPHS = "photographs"
 # An interval over fewer units says nothing. With two, its t distribution has one degree of freedom.
 MIN_UNITS = 3
 # Index of the object of a detection: it is of no object, or of a crowd, which does not count.
@@ -268,7 +266,7 @@ def estimate(
         return statistic(weights)[None]
 
     # Units of a group count from 0.
-    units = units or Units([np.arange(image_count)], PHOTOGRAPHS)
+    units = units or Units([np.arange(image_count)], "photographs")
     (every_unit,) = units.groups
     unit_of_image = [np.unique(every_unit[images], return_inverse=True)[1] for images in groups]
     (result,) = leave_out(of_groups, Units(unit_of_image, units.over))
