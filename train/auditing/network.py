@@ -357,14 +357,12 @@ class Recommendation:
 
     Attributes:
         remedy: Name of the recommended remedy. None if none is recommended.
-        advice: What the user should do, in words.
-        sentence: The advice and the reason for it.
+        sentence: What the user should do, and the reason for it.
         table: Metric of the network with each remedy, and its gain over the
             original network.
     """
 
     remedy: str | None
-    advice: str
     sentence: str
     table: Table
 
@@ -436,5 +434,5 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
         rows.append([name, value, tables.format_interval(gains.get(name), "+")])
     intervals = tables.describe_intervals(gains.values())
     table = Table(intervals, ["network", title, "gain over the original network"], rows)
-    remedy, advice = None if gain is None else chosen, ADVICE[chosen]
-    return Recommendation(remedy, advice, f"{advice} {reason}", table)
+    remedy = None if gain is None else chosen
+    return Recommendation(remedy, f"{ADVICE[chosen]} {reason}", table)

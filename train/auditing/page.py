@@ -121,13 +121,12 @@ def write_audit_page(
         recommendation = audited.recommend(evaluations)
     is_unknown = networks[0 if folders else -1].verdict[0] == "Unknown"
     if is_unknown and recommendation is not None and recommendation.remedy is None:
-        first = audited.NEXT_TRAINING
-        recommendation = replace(recommendation, advice=first, sentence=first)
+        recommendation = replace(recommendation, sentence=audited.NEXT_TRAINING)
     advice = []
     if recommendation is not None:
         # The top of the report shows the gain by hardening already.
         is_shown = recommendation.remedy == audited.HARDENING
-        advice = [recommendation.advice if is_shown else recommendation.sentence]
+        advice = [audited.ADVICE[audited.HARDENING] if is_shown else recommendation.sentence]
     elif is_unknown:
         advice = [audited.NEXT_TRAINING]
     elif screen.answer in (VERDICTS["No"], VERDICTS["Perhaps not"]):
