@@ -60,14 +60,12 @@ class Audited(NamedTuple):
     Attributes:
         path: Path of report.html.
         screen: Top of the report: its headline, main numbers and sentences.
-        label: Class whose objects were tested.
         networks: Each network by the name of the subfolder with its results.
         recommendation: Recommended remedy. None if it is unknown.
     """
 
     path: Path
     screen: first_screen.FirstScreen
-    label: str
     networks: Mapping[str, AuditedNetwork]
     recommendation: Recommendation | None
 
@@ -77,7 +75,7 @@ class Audited(NamedTuple):
         reports = networks[audited.CLASSIFIER], networks.get(audited.HARDENED)
         recommendation = "" if self.recommendation is None else self.recommendation.sentence
         page = self.path.read_text(encoding="utf-8")
-        return AuditReport(self.label, *reports, recommendation, page)
+        return AuditReport(self.networks[audited.CLASSIFIER].label, *reports, recommendation, page)
 
 
 def write_audit_page(
@@ -105,7 +103,7 @@ def write_audit_page(
         screen = screen_of_photographs(results)
         title = "Audit: photographs in the light of a projector"
         path = write_page(out, title=title, screen=screen, lead=caveats, **content)
-        return Audited(path, screen, label, {}, None)
+        return Audited(path, screen, {}, None)
     by_key = {key: AuditedNetwork(label, name, out / key) for key, name in names.items()}
     networks = [*by_key.values()]
     # The first kind of test images decides the top of the page and the recommendation.
@@ -159,7 +157,7 @@ def write_audit_page(
         detections=detection_sections(results, in_words(label)),
         **content,
     )
-    return Audited(path, screen, label, by_key, recommendation)
+    return Audited(path, screen, by_key, recommendation)
 
 
 def _slider(networks: Networks) -> dict[str, Any]:
