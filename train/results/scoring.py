@@ -344,11 +344,10 @@ def write(scores: Scores, out: Path) -> None:
     predictions.write_predictions(out / predictions.PREDICTIONS, predicted.predictions)
     sheet = contact_sheet(predicted.predictions, predicted.images.numpy())
     write_image(out / predictions.CONTACT_SHEET, sheet)
-    pooled = scores.pooled
-    groups = pooled.by_label if len(predicted.labels) > 1 else pooled.by_source
+    groups = scores.pooled.groups("label" if len(predicted.labels) > 1 else "source")
     # The log-odds of positives and negatives of each group.
     curves = {name: pool.scores for name, pool in groups.items()}
-    write_roc(out, pooled.all.scores, curves, scores.label)
+    write_roc(out, scores.pooled.all.scores, curves, scores.label)
     predictions.write_summary(out, scores.to_summary())
 
 
