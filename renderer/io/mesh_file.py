@@ -20,6 +20,7 @@ from renderer.errors import MAX_MAGNITUDE, require_memory
 from renderer.io.files import file_below
 from renderer.io.images import eight_bits, identify
 from renderer.mesh import NO_TEXTURE, Mesh, transformed
+from renderer.visibility.numpy import doubled_areas
 
 # Largest difference from the range [0, 1] that counts as rounding of a color.
 TOLERANCE = 1e-3
@@ -316,7 +317,7 @@ def triangulate(
     # Corners in the plane of their polygon, in which it is counter-clockwise, shape (C, 2).
     points = _projected(corners, starts, sizes)
     # A fan of counter-clockwise triangles covers the polygon. A triangle always is such a fan.
-    is_fan = np.minimum.reduceat(_doubled_areas(points, triangles), first_triangles) >= 0
+    is_fan = np.minimum.reduceat(doubled_areas(points[triangles].T), first_triangles) >= 0
     parts = [triangles[is_fan[polygons]]]
     owners = [polygons[is_fan[polygons]]]
     crossing_count = 0
@@ -351,12 +352,6 @@ def _projected(corners: np.ndarray, starts: np.ndarray, sizes: np.ndarray) -> np
     return np.take_along_axis(relative, remaining.repeat(sizes, axis=0), axis=1)
 
 
-def _doubled_areas(points: np.ndarray, triangles: np.ndarray) -> np.ndarray:
-    """Compute twice the areas (T,) of triangles (T, 3) of points (N, 2), negative if clockwise."""
-    a, b, c = points[triangles].swapaxes(0, 1)
-    return (b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]
-
-
 def _clip_ears(points: Num[np.ndarray, "N 2"]) -> tuple[Int[np.ndarray, "T 3"], bool]:
     """Divide a counter-clockwise polygon into triangles, and tell whether it intersects itself."""
     count = len(points)
@@ -366,7 +361,7 @@ def _clip_ears(points: Num[np.ndarray, "N 2"]) -> tuple[Int[np.ndarray, "T 3"], 
     if not len(triangles):  # The polygon has no area.
         fan = np.arange(1, count - 1)
         return np.stack([0 * fan, fan, fan + 1], axis=1), False
-    if _doubled_areas(points, triangles).sum() < 0:
+    if doubled_areas(points[triangles].T).sum() < 0:
         triangles = triangles[:, ::-1]
     # The ears leave out some corners on straight edges. Each triangle
     # at such an edge is divided, so that it has these corners, too.
@@ -388,5 +383,5 @@ def _clip_ears(points: Num[np.ndarray, "N 2"]) -> tuple[Int[np.ndarray, "T 3"], 
     # itself cover another area.
     following = np.roll(points, -1, axis=0)
     area = (points[:, 0] * following[:, 1] - points[:, 1] * following[:, 0]).sum()
-    covered = np.abs(_doubled_areas(points, triangles)).sum()
+    covered = np.abs(doubled_areas(points[triangles].T)).sum()
     return triangles, bool(abs(covered - area) > _AREA_TOLERANCE * np.ptp(points, axis=0).prod())

@@ -69,8 +69,6 @@ TRANSFER = "transfer.json"
 DETECTED = "detections.json"
 # Folder of the scores on photographs with boxes.
 BOXED = "photographs_with_boxes"
-# What the intervals are over.
-VIEWS = "views"
 # Number of points of the curve of recall against false detections.
 CURVE_POINTS = 50
 # End of the key of a network whose images are normalized before they are classified.
@@ -480,7 +478,7 @@ def find_in_lights(
     metrics: dict[str, Any] = {}
     for title, numbered in groups.items():
         # Lights of the same view are no independent units, so the interval is over the views.
-        units = Units([np.array([unit for unit, _ in numbered])], VIEWS)
+        units = Units([np.array([unit for unit, _ in numbered])], "views")
         pairs = [pair for _, pair in numbered]
         if isinstance(task, Detection):
             at_iou, at_half = (_match(pairs, iou) for iou in (task.iou, 0.5))
@@ -506,8 +504,8 @@ def _curve(matches: Matches) -> list[tuple[float, ...]]:
     """Return false detections per image and recall at descending thresholds."""
     every = np.ones((1, matches.image_count))
     # Objects that are never detected have the score -inf, which is no threshold.
-    finite = matches.object_score[np.isfinite(matches.object_score)]
-    thresholds = np.unique([*finite, *matches.score])[::-1]
+    scores = matches.objects.score
+    thresholds = np.unique([*scores[np.isfinite(scores)], *matches.detections.score])[::-1]
     measures = (matches.false_per_image, matches.recall)
     # CURVE_POINTS thresholds are enough for the plot.
     return [

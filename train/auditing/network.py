@@ -42,7 +42,7 @@ ORIGINAL = "the original network"
 LIGHT_ALONE = "normalized light"
 HARDENING = "hardening"
 BOTH = "hardening and normalized light"
-# What a user does for each remedy.
+# What a user does for each remedy, from the cheapest to the most expensive.
 CHECK = "Choose its threshold and check it on your own photographs first."
 ADVICE = {
     ORIGINAL: "Keep the original network.",
@@ -64,8 +64,6 @@ NEXT_TRAINING = (
     "First, train the network on these objects in natural light: most of the gain of hardening "
     "comes from seeing the objects at all."
 )
-# Remedies are compared by top-1 accuracy if there are several positive classes.
-TOP1 = "class_top1"
 
 
 @dataclass(frozen=True)
@@ -317,13 +315,10 @@ class AuditedNetwork:
 
         None if no view is recognized before the attacks.
         """
-        # The last count of misclassified views is that of the largest radius.
-        lost = {
-            kind: counts["adversarial"][-1] / counts["correct"]
-            for kind, counts in self.counts.items()
-            if counts["correct"]
-        }
-        return max(lost, key=lambda kind: lost[kind], default=None)
+        # The last fraction is that of the largest radius.
+        kept = {kind: self.remaining(kind, "adversarial")[-1].value for kind in self.counts}
+        known = {kind: value for kind, value in kept.items() if value is not None}
+        return min(known, key=lambda kind: known[kind], default=None)
 
     def remaining(self, kind: str, method: str) -> list[Proportion]:
         """Return the fraction of the views that stay correct, of those correct before, by radius.
@@ -362,14 +357,12 @@ class Recommendation:
 
     Attributes:
         remedy: Name of the recommended remedy. None if none is recommended.
-        advice: What the user should do, in words.
-        sentence: The advice and the reason for it.
+        sentence: What the user should do, and the reason for it.
         table: Metric of the network with each remedy, and its gain over the
             original network.
     """
 
     remedy: str | None
-    advice: str
     sentence: str
     table: Table
 
@@ -399,8 +392,7 @@ def name_remedies(networks: Mapping[str, Classifier]) -> dict[str, str]:
         name = HARDENING if network.normalized_light is None else BOTH
         name = name if key.startswith(HARDENED) else LIGHT_ALONE
         subfolders[ORIGINAL if key == CLASSIFIER else name] = key
-    order = (ORIGINAL, LIGHT_ALONE, HARDENING, BOTH)
-    return {name: subfolders[name] for name in order if name in subfolders}
+    return {name: subfolders[name] for name in ADVICE if name in subfolders}
 
 
 def recommend(evaluations: Evaluations) -> Recommendation | None:
@@ -414,7 +406,7 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
     """
     original, *remedies = evaluations
     positives = evaluations[original][0].pooled.all.positives
-    metric = TOP1 if len(positives.labels) > 1 else EQUAL_RATE
+    metric = "class_top1" if len(positives.labels) > 1 else EQUAL_RATE
 
     def gain_over(name: str, reference: str) -> Difference | None:
         return difference(evaluations[name], evaluations[reference], ALL, metric)
@@ -442,5 +434,5 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
         rows.append([name, value, tables.format_interval(gains.get(name), "+")])
     intervals = tables.describe_intervals(gains.values())
     table = Table(intervals, ["network", title, "gain over the original network"], rows)
-    remedy, advice = None if gain is None else chosen, ADVICE[chosen]
-    return Recommendation(remedy, advice, f"{advice} {reason}", table)
+    remedy = None if gain is None else chosen
+    return Recommendation(remedy, f"{ADVICE[chosen]} {reason}", table)

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 from train.auditing import lights
 from train.auditing import network as audited
-from train.auditing.lights import ADDITIONAL_STEPS, KINDS, NORMALIZED, SIDE, STEPS, VIEWS
+from train.auditing.lights import ADDITIONAL_STEPS, KINDS, NORMALIZED, SIDE, STEPS
 from train.auditing.network import IN_WORDS, AuditedNetwork, AuditReport, Recommendation
 from train.auditing.relit import relit_sections, screen_of_photographs
 from train.results import compare, first_screen
@@ -60,14 +60,12 @@ class Audited(NamedTuple):
     Attributes:
         path: Path of report.html.
         screen: Top of the report: its headline, main numbers and sentences.
-        label: Class whose objects were tested.
         networks: Each network by the name of the subfolder with its results.
         recommendation: Recommended remedy. None if it is unknown.
     """
 
     path: Path
     screen: first_screen.FirstScreen
-    label: str
     networks: Mapping[str, AuditedNetwork]
     recommendation: Recommendation | None
 
@@ -77,7 +75,7 @@ class Audited(NamedTuple):
         reports = networks[audited.CLASSIFIER], networks.get(audited.HARDENED)
         recommendation = "" if self.recommendation is None else self.recommendation.sentence
         page = self.path.read_text(encoding="utf-8")
-        return AuditReport(self.label, *reports, recommendation, page)
+        return AuditReport(self.networks[audited.CLASSIFIER].label, *reports, recommendation, page)
 
 
 def write_audit_page(
@@ -105,7 +103,7 @@ def write_audit_page(
         screen = screen_of_photographs(results)
         title = "Audit: photographs in the light of a projector"
         path = write_page(out, title=title, screen=screen, lead=caveats, **content)
-        return Audited(path, screen, label, {}, None)
+        return Audited(path, screen, {}, None)
     by_key = {key: AuditedNetwork(label, name, out / key) for key, name in names.items()}
     networks = [*by_key.values()]
     # The first kind of test images decides the top of the page and the recommendation.
@@ -121,13 +119,12 @@ def write_audit_page(
         recommendation = audited.recommend(evaluations)
     is_unknown = networks[0 if folders else -1].verdict[0] == "Unknown"
     if is_unknown and recommendation is not None and recommendation.remedy is None:
-        first = audited.NEXT_TRAINING
-        recommendation = replace(recommendation, advice=first, sentence=first)
+        recommendation = replace(recommendation, sentence=audited.NEXT_TRAINING)
     advice = []
     if recommendation is not None:
         # The top of the report shows the gain by hardening already.
         is_shown = recommendation.remedy == audited.HARDENING
-        advice = [recommendation.advice if is_shown else recommendation.sentence]
+        advice = [audited.ADVICE[audited.HARDENING] if is_shown else recommendation.sentence]
     elif is_unknown:
         advice = [audited.NEXT_TRAINING]
     elif screen.answer in (VERDICTS["No"], VERDICTS["Perhaps not"]):
@@ -160,7 +157,7 @@ def write_audit_page(
         detections=detection_sections(results, in_words(label)),
         **content,
     )
-    return Audited(path, screen, label, by_key, recommendation)
+    return Audited(path, screen, by_key, recommendation)
 
 
 def _slider(networks: Networks) -> dict[str, Any]:
@@ -360,7 +357,7 @@ def detection_sections(networks: Mapping[str, Path], label: str) -> list[dict[st
         if not (folder / lights.DETECTED).exists():
             continue
         content = read_json(folder / lights.DETECTED)
-        title = f"renders; 95% intervals over {VIEWS}"
+        title = "renders; 95% intervals over views"
         tables = [_metrics_table(content["metrics"], title, "light")]
         # The same network with the remedy "normalized light", which may have scores, too.
         normalized = folder.with_name(f"{folder.name}{NORMALIZED}")
@@ -368,8 +365,7 @@ def detection_sections(networks: Mapping[str, Path], label: str) -> list[dict[st
             if (path / lights.BOXED / SUMMARY).exists():
                 by_label = read_json(path / lights.BOXED / SUMMARY)["by_label"]
                 tables.append(_metrics_table(by_label, f"photographs{end}", "class"))
-        points = {name: [[(x, y) for x, y in content["curve"]]]}
-        chart = plot_curves(points, "recall", "false detections per image")
+        chart = plot_curves({name: [content["curve"]]}, "recall", "false detections per image")
         # The curve of a detector that finds nothing is empty, like that of a segmenter.
         about = ABOUT if "recall" in content["metrics"]["plain light"] else ABOUT_PIXELS
         shown = {"tables": tables, "charts": [chart] if chart else []}

@@ -8,7 +8,7 @@ its only test.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,7 +31,7 @@ from train.results.first_screen import FirstScreen, ShownMetric
 from train.results.intervals import Units, leave_out_of_mean
 from train.results.pictures import Picture, evenly_spaced, read_pictures
 from train.results.predictions import RELIT
-from train.results.tables import Proportion, Table, format_fraction, fraction, join_words
+from train.results.tables import Proportion, Table, format_fraction, join_words
 from train.run_folder import read_json, write_json
 
 # Pictures are written for this many photographs.
@@ -143,13 +143,8 @@ class RelitScores(ShortRepr):
         """
         # A photograph counts if all slides leave its class.
         is_kept = np.array([item.kept[light] == self.slides for item in self.photographs])
-        kept = fraction(int(is_kept.sum()), len(is_kept))
         _, unit = np.unique([item.path for item in self.photographs], return_inverse=True)
-        # Each photograph has one prediction, so Wilson's interval holds.
-        if self.shown == len(unit):
-            return kept
-        over = leave_out_of_mean(is_kept, Units([unit], "photographs"))
-        return replace(kept, **asdict(over.estimate))
+        return leave_out_of_mean(is_kept, Units([unit], "photographs")).proportion(is_kept)
 
     def tables(self) -> list[Table]:
         """Make a table of the photographs that keep their class, and one with a row for each class.

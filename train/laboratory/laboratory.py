@@ -306,11 +306,6 @@ def path_traced(
         return np.sum(images, axis=0)
 
 
-def _rgb(color: np.ndarray) -> dict[str, Any]:
-    """Convert a linear RGB color of shape (3,) to the dictionary that Mitsuba takes."""
-    return {"type": "rgb", "value": [float(channel) for channel in color]}
-
-
 def _light_sources(shot: Shot) -> list[dict[str, Any]]:
     """Describe the light sources of a shot by dictionaries that Mitsuba takes."""
     if shot.environment is not None:
@@ -318,14 +313,14 @@ def _light_sources(shot: Shot) -> list[dict[str, Any]]:
     lights = []
     for position, pattern in zip(shot.projectors, shot.patterns, strict=True):
         distance = float(np.linalg.norm(position - shot.center))
-        half_angle = np.arctan(PROJECTOR_HALF_WIDTH / distance)
-        fov = 2 * float(np.degrees(half_angle))
+        fov = 2 * float(np.degrees(np.arctan(PROJECTOR_HALF_WIDTH / distance)))
         # The irradiance of a projector falls with the square of the distance.
         power = shot.brightness * distance**2
         pose = look_at(position, shot.center)
         lights.append(projector(pose, fov, {"bitmap": pattern}, power / len(shot.patterns)))
     # Light from all directions, as from the walls of a room.
-    lights.append({"type": "constant", "radiance": _rgb(shot.ambient)})
+    ambient = {"type": "rgb", "value": shot.ambient.tolist()}
+    lights.append({"type": "constant", "radiance": ambient})
     return lights
 
 
@@ -336,7 +331,7 @@ def _plane(pose: Float[np.ndarray, "4 4"], color: Float[np.ndarray, " 3"]) -> di
     faces +z, to the world; `color` is linear RGB.
     """
     scale = np.diag([PLANE_HALF_WIDTH, PLANE_HALF_WIDTH, 1.0, 1.0])
-    surface = {"type": "diffuse", "reflectance": _rgb(color)}
+    surface = {"type": "diffuse", "reflectance": {"type": "rgb", "value": color.tolist()}}
     return {"type": "rectangle", "to_world": pose @ scale, "bsdf": surface}
 
 

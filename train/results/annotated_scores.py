@@ -295,9 +295,6 @@ def _score(
 
 def evaluate_segmenter(network: TaskNetwork, folder: Path, how: Showing) -> SegmentationScores:
     """Segment photographs, and compare the classes of the pixels with those of masks."""
-    if len(network.classes) > NO_CLASS_PIXEL:
-        reason = f"masks can have at most {NO_CLASS_PIXEL}, as {NO_CLASS_PIXEL} is no class"
-        raise InputError(f"{network.title} has {len(network.classes)} classes: {reason}")
     photographs, masks, missing = annotated.read_masks(folder)
     pictures: dict[str, Tensor] = {}
     count = 0

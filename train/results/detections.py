@@ -16,15 +16,10 @@ from augment.settings import NO_CLASS_PIXEL
 from train.results.intervals import Units, leave_out
 from train.results.tables import Estimate
 
-# What the intervals are over.
-PHOTOGRAPHS = "photographs"
 # An interval over fewer units says nothing. With two, its t distribution has one degree of freedom.
 MIN_UNITS = 3
 # Index of the object of a detection: it is of no object, or of a crowd, which does not count.
 NO_OBJECT, CROWD = -1, -2
-# Fields of `Matches` that have an entry for each detection, and those with one for each object.
-DETECTION_COLUMNS = ("label", "image", "score", "is_right")
-OBJECT_COLUMNS = ("object_label", "object_image", "object_score")
 # Classes of the pixels of an image.
 ClassMap = Int[np.ndarray, "H W"]
 # How often each of n images counts, in k rows.
@@ -81,46 +76,34 @@ def match(found: Found, marked: Marked, iou: float) -> Int[np.ndarray, " N"]:
 
 @dataclass(frozen=True)
 class Matches:
-    """Detections and objects in a number of images.
+    """Detections and objects in a number of images, as records.
 
     Attributes:
         image_count: Number of images.
-        label: Class of each detection. The detections are in descending order of their scores.
-        image: Index of the image of each detection.
-        score: Score of each detection.
-        is_right: Whether a detection is of an object.
-        object_label: Class of each object.
-        object_image: Index of the image of each object.
-        object_score: Score of the detection of each object. −inf without one.
+        detections: Records of the detections in descending order of their scores: the class
+            `label`, the index of the `image`, the `score`, and `is_right`, whether the detection
+            is of an object.
+        objects: Records of the objects: the class `label`, the index of the `image`, and the
+            `score` of the detection of the object. −inf without one.
     """
 
     image_count: int
-    label: Int[np.ndarray, " N"]
-    image: Int[np.ndarray, " N"]
-    score: Float[np.ndarray, " N"]
-    is_right: Bool[np.ndarray, " N"]
-    object_label: Int[np.ndarray, " M"]
-    object_image: Int[np.ndarray, " M"]
-    object_score: Float[np.ndarray, " M"]
+    detections: np.recarray
+    objects: np.recarray
 
     def of(self, labels: Sequence[int]) -> "Matches":
         """Return the matches of some classes."""
-        return self.choose(np.isin(self.label, labels), np.isin(self.object_label, labels))
-
-    def choose(self, detections: Any, objects: Any) -> "Matches":
-        """Return the matches of some detections and objects, by masks or indices of NumPy."""
-        of_detections = {name: getattr(self, name)[detections] for name in DETECTION_COLUMNS}
-        of_objects = {name: getattr(self, name)[objects] for name in OBJECT_COLUMNS}
-        return replace(self, **of_detections, **of_objects)
+        kinds: tuple[Any, ...] = (self.detections, self.objects)
+        return Matches(self.image_count, *(kind[np.isin(kind.label, labels)] for kind in kinds))
 
     def recall(self, threshold: float, counts: Counts) -> Float[np.ndarray, " k"]:
         """Compute the fraction of the objects that are detected with at least a score.
 
         `counts` says how often each image counts. The recall of no object is NaN.
         """
-        weights = counts[:, self.object_image]
+        weights = counts[:, self.objects.image]
         with np.errstate(invalid="ignore"):
-            return (weights * (self.object_score >= threshold)).sum(-1) / weights.sum(-1)
+            return (weights * (self.objects.score >= threshold)).sum(-1) / weights.sum(-1)
 
     def false_per_image(self, threshold: float, counts: Counts) -> Float[np.ndarray, " k"]:
         """Compute the number of detections per image that have a score, but no object."""
@@ -128,7 +111,8 @@ class Matches:
 
     def images_of_false(self, threshold: float) -> Int[np.ndarray, " false"]:
         """Return the index of the image of each detection that has a score, but no object."""
-        return self.image[(self.score >= threshold) & ~self.is_right]
+        found = self.detections
+        return found.image[(found.score >= threshold) & ~found.is_right]
 
     def average_precision(self, counts: Counts) -> Float[np.ndarray, " k"]:
         """Compute the average precision of one class, as COCO does. That of no object is NaN."""
@@ -136,12 +120,12 @@ class Matches:
 
     def _average_precision(self, counts: Float[np.ndarray, " n"]) -> float:
         """Compute the average precision of one class if image i counts `counts[i]` times."""
-        object_count = counts[self.object_image].sum()
+        object_count = counts[self.objects.image].sum()
         if not object_count:
             return np.nan
-        weights = counts[self.image]
+        weights = counts[self.detections.image]
         # Correct detections among those with at least each score.
-        right = np.cumsum(weights * self.is_right)
+        right = np.cumsum(weights * self.detections.is_right)
         # A detection in an image that counts 0 times may come first.
         precision = right / np.maximum(np.cumsum(weights), np.spacing(1))
         # The precision at a recall is the highest one at this recall or a higher one.
@@ -153,16 +137,15 @@ class Matches:
 
 def join(parts: Sequence[Matches]) -> Matches:
     """Join the matches in several images, each of one image."""
-    columns = {
-        name: np.concatenate([getattr(part, name) for part in parts])
-        for name in (*DETECTION_COLUMNS, *OBJECT_COLUMNS)
-    }
-    # The index of the image in each part is 0.
-    for name, of in (("image", "label"), ("object_image", "object_label")):
-        columns[name] = np.arange(len(parts)).repeat([len(getattr(part, of)) for part in parts])
-    matches = Matches(len(parts), **columns)
+    joined: list[Any] = []
+    for of_images in zip(*((part.detections, part.objects) for part in parts), strict=True):
+        records = np.concatenate(of_images).view(np.recarray)
+        # The index of the image in each part is 0.
+        records.image = np.arange(len(parts)).repeat([*map(len, of_images)])
+        joined.append(records)
+    found, objects = joined
     # In descending order of the scores, as `Matches` says.
-    return matches.choose(np.argsort(-matches.score, kind="stable"), ...)
+    return Matches(len(parts), found[np.argsort(-found.score, kind="stable")], objects)
 
 
 def match_image(found: Found, marked: Marked, iou: float = 0.5) -> Matches:
@@ -172,17 +155,16 @@ def match_image(found: Found, marked: Marked, iou: float = 0.5) -> Matches:
     # Objects without a detection have the score -inf.
     score_of_object = np.full(len(marked.labels), -np.inf)
     score_of_object[index[is_right]] = found.scores[is_right]
-    matches = Matches(
-        1,
-        label=found.labels,
-        image=np.zeros(len(index), int),
-        score=found.scores,
-        is_right=is_right,
-        object_label=marked.labels,
-        object_image=np.zeros(len(marked.labels), int),
-        object_score=score_of_object,
-    )
-    return matches.choose(index != CROWD, ~marked.is_crowd)
+    image, image_of_object = (np.zeros(len(of.labels), int) for of in (found, marked))
+    detections = _records(label=found.labels, image=image, score=found.scores, is_right=is_right)
+    objects = _records(label=marked.labels, image=image_of_object, score=score_of_object)
+    return Matches(1, detections[index != CROWD], objects[~marked.is_crowd])
+
+
+def _records(**columns: np.ndarray) -> np.recarray:
+    """Make records of columns."""
+    kinds = [(name, column.dtype) for name, column in columns.items()]
+    return np.rec.fromarrays([*columns.values()], kinds)
 
 
 @dataclass(frozen=True)
@@ -218,7 +200,7 @@ def score(
     joined = matches.of(labels)
     by_label = [(at_half or matches).of([label]) for label in labels]
     # Classes without objects have no average precision.
-    shown = [item for item in by_label if len(item.object_score)]
+    shown = [item for item in by_label if len(item.objects)]
 
     def mean_precision(counts: np.ndarray) -> np.ndarray:
         values = np.stack([item.average_precision(counts) for item in shown])
@@ -248,7 +230,7 @@ def score(
         total = numbers.sum()
         low, high = gammaincinv([total, total + 1], [0.025, 0.975]) / joined.image_count
     false_detections = Estimate(value, low, high, odds.over)
-    return DetectionMetrics(len(joined.object_score), recall, precision, false_detections)
+    return DetectionMetrics(len(joined.objects), recall, precision, false_detections)
 
 
 def _groups(matches: Matches) -> list[np.ndarray]:
@@ -258,7 +240,7 @@ def _groups(matches: Matches) -> list[np.ndarray]:
     images that show it. With fewer than two images without objects, all images are one group.
     """
     has_object = np.zeros(matches.image_count, bool)
-    has_object[matches.object_image] = True
+    has_object[matches.objects.image] = True
     others = np.flatnonzero(~has_object)
     if len(others) < 2:
         return [np.arange(matches.image_count)]
@@ -284,7 +266,7 @@ def estimate(
         return statistic(weights)[None]
 
     # Units of a group count from 0.
-    units = units or Units([np.arange(image_count)], PHOTOGRAPHS)
+    units = units or Units([np.arange(image_count)], "photographs")
     (every_unit,) = units.groups
     unit_of_image = [np.unique(every_unit[images], return_inverse=True)[1] for images in groups]
     (result,) = leave_out(of_groups, Units(unit_of_image, units.over))

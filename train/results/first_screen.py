@@ -13,20 +13,13 @@ import numpy as np
 
 from renderer.errors import InputError
 from train.data.photo import DESCRIPTION
-from train.results import compare
+from train.results import compare, tables
 from train.results.compare import Difference
 from train.results.metrics import CLASS_RATE, Pool
 from train.results.pictures import Picture, read_square
 from train.results.predictions import Predictions
 from train.results.store import RunSummary
-from train.results.tables import (
-    IMAGES,
-    Estimate,
-    Table,
-    describe_intervals,
-    format_interval,
-    join_words,
-)
+from train.results.tables import Estimate, Table
 from train.run_folder import read_json
 from train.settings import KEPT_ASIDE, PHOTOGRAPHS, in_words
 
@@ -121,7 +114,7 @@ class FirstScreen:
         rows = []
         for metric in self.numbers:
             shown = filter(None, (metric.before, metric.after))
-            cells = [format_interval(estimate, form=metric.form) for estimate in shown]
+            cells = [tables.format_interval(estimate, form=metric.form) for estimate in shown]
             rows.append([metric.title, *cells])
         table = Table("", ["", *self.names], rows)
         return f"{' '.join([self.answer, *self.sentences])}\n\n{table}"
@@ -135,7 +128,7 @@ def describe_place(folder: Path | None, name: str) -> str:
     patterns = settings.get("patterns", [])
     if not patterns or settings.get("environments"):
         return "Under unusual lighting"
-    return f"Under projected patterns ({join_words(patterns, 'and')})"
+    return f"Under projected patterns ({tables.join_words(patterns, 'and')})"
 
 
 def compare_networks(
@@ -159,7 +152,7 @@ def compare_networks(
     # All seeds have the same images, so the first one gives their numbers and labels.
     pool = after[0].pooled.all
     labels = pool.predictions.labels
-    label = join_words([in_words(item) for item in labels], "or")
+    label = tables.join_words([in_words(item) for item in labels], "or")
     each, rate = "", "false_positive_rate"
     if len(labels) > 1:
         each, rate = ", mean over these classes", CLASS_RATE
@@ -185,7 +178,7 @@ def compare_networks(
         was, is_now = (compare.mean_metric(item, compare.ALL, metric) for item in (before, after))
         if was is not None and is_now is not None:
             has_one_seed = len(before) == len(after) == 1
-            interval = describe_intervals([is_now]) if has_one_seed else is_now.over
+            interval = tables.describe_intervals([is_now]) if has_one_seed else is_now.over
             form = ".2f" if metric == "auc" else ".0%"
             numbers.append(ShownMetric(title, note, was, is_now, form, interval))
 
@@ -200,10 +193,9 @@ def compare_networks(
     known = {text: gains[metric] for metric, text in reasons.items()}
     sentences += [gain_sentence(text, gain) for text, gain in known.items() if gain is not None]
 
-    images = f"{_describe_images(pool, labels)} The gains have {describe_intervals([auc])}."
-    trained = _classes_with_trained_objects(after[0].run, labels, folder)
-    if trained:
-        trained_labels = join_words(trained, "and")
+    images = f"{_describe_images(pool, labels)} The gains have {tables.describe_intervals([auc])}."
+    if trained := _classes_with_trained_objects(after[0].run, labels, folder):
+        trained_labels = tables.join_words(trained, "and")
         images += f" The images of {trained_labels} show the objects of the training in new light."
     note = f"For other objects, any answer but {label} counts as right. Shown are the images on "
     order = "first one for each kind of object and light, then more"
@@ -223,10 +215,10 @@ def _describe_images(pool: Pool, labels: Sequence[str]) -> str:
     # Object of each image without a positive class. A photograph has one prediction for each label.
     others = {item.path: item.mesh for item in shown if item.label not in labels}
     scored = pool.metrics.auc
-    label = join_words([in_words(item) for item in labels], "or")
+    label = tables.join_words([in_words(item) for item in labels], "or")
     # Without the names of the objects, the interval is over images.
     counts = (scored.positive_objects, len({*others.values()} - {None}) or len(others))
-    objects = ["" if scored.over == IMAGES else f" ({count:,} objects)" for count in counts]
+    objects = ["" if scored.over == tables.IMAGES else f" ({count:,} objects)" for count in counts]
     positives = f"{scored.positives:,} images of {label}{objects[0]}"
     negatives = f"{len(others):,} of other objects{objects[1]}"
     text = f"Scored on {positives} and {negatives}."

@@ -5,14 +5,14 @@ The statistics are the AUC, the recall at a given false-positive rate, and means
 
 import fractions
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Num, Shaped
 
-from train.results.tables import Estimate, fraction, wilson
+from train.results.tables import NORMAL_QUANTILE, Estimate, Proportion, fraction, wilson
 
 # False-positive rates at which the recall is reported. Decimal strings are exact,
 # while a float such as 0.1 is not.
@@ -110,6 +110,13 @@ class Jackknife:
         """Value with its 95% interval."""
         low, high = map(float, self.interval)
         return Estimate(float(self.value), low, high, self.over)
+
+    def proportion(self, hits: Shaped[np.ndarray, " n"]) -> Proportion:
+        """Count the hits of which this is the mean. Without a repeated unit, Wilson's interval."""
+        proportion = fraction(int(hits.sum()), len(hits))
+        if self.unit_count == proportion.n:
+            return replace(proportion, over=self.over)
+        return replace(proportion, **asdict(self.estimate))
 
 
 def leave_out(statistic: Callable[..., np.ndarray], units: Units) -> list[Jackknife]:
@@ -238,8 +245,7 @@ def change_ends(one: Jackknife, other: Jackknife, is_paired: bool = True) -> np.
     if one.at_ends is not None and other.at_ends is not None:
         is_same &= (one.at_ends == other.at_ends).all(axis=0)
     # The upper end of Wilson's interval for 0 of `unit_count` units.
-    margin = fraction(0, one.unit_count).high
-    assert margin is not None
+    _, margin = wilson(0, one.unit_count, NORMAL_QUANTILE)
     return np.where(is_same, np.multiply.outer([-margin, margin], np.ones_like(value)), ends)
 
 
@@ -310,21 +316,18 @@ def class_means(
 def auc_and_recalls(
     positives: Num[np.ndarray, " n"],
     negatives: Num[np.ndarray, " m"],
-    positive_counts: Int[np.ndarray, "... n"] | None = None,
-    negative_counts: Int[np.ndarray, "... m"] | None = None,
+    *counts: Int[np.ndarray, "... _"],
 ) -> Float[np.ndarray, "4 ..."]:
     """Compute the AUC, and the recall at each false-positive rate in `RATES`.
 
     The AUC is the probability that a random positive has a higher score than a
     random negative. A tie counts half (Mann and Whitney 1947). The recall is the
     fraction of the positives that score above the threshold for a
-    false-positive rate. A positive at the threshold counts as missed. The counts say how often each
-    image counts. None counts each once.
+    false-positive rate. A positive at the threshold counts as missed. `counts` say how often each
+    positive and each negative counts, shapes (..., n) and (..., m). Without them, each counts once.
     """
-    if positive_counts is None:
-        positive_counts = np.ones(len(positives), int)
-    if negative_counts is None:
-        negative_counts = np.ones(len(negatives), int)
+    ones = (np.ones(len(scores), int) for scores in (positives, negatives))
+    positive_counts, negative_counts = counts or ones
     positive_total = positive_counts.sum(axis=-1)
 
     order = negatives.argsort()
@@ -365,10 +368,9 @@ def thresholds(
     counts_up_to = counts[..., order].cumsum(axis=-1)
     total = counts_up_to[..., -1]
     thresholds_by_rate = []
-    for rate in rates:
-        # A float would be inexact: 0.29 * 100 is less than 29 and would become 28.
-        exact_rate = fractions.Fraction(rate)
-        allowed_above = exact_rate.numerator * total // exact_rate.denominator
+    # A float would be inexact: 0.29 * 100 is less than 29 and would become 28.
+    for rate in map(fractions.Fraction, rates):
+        allowed_above = rate.numerator * total // rate.denominator
         needed_up_to = total - allowed_above
         # The index is the number of scores that too many negatives exceed.
         index = (counts_up_to < needed_up_to[..., None]).sum(axis=-1)
@@ -388,14 +390,8 @@ def roc_curve(
     """
     distinct_scores = np.unique([*positives, *negatives])
     descending_thresholds = np.append(distinct_scores[::-1], -np.inf)
-    false_positive_rate = _fraction_above(negatives, descending_thresholds)
-    recall = _fraction_above(positives, descending_thresholds)
+    false_positive_rate, recall = (
+        (len(scores) - np.sort(scores).searchsorted(descending_thresholds, "right")) / len(scores)
+        for scores in (negatives, positives)
+    )
     return false_positive_rate, recall, descending_thresholds
-
-
-def _fraction_above(
-    scores: Float[np.ndarray, " n"], thresholds: Float[np.ndarray, " k"]
-) -> Float[np.ndarray, " k"]:
-    """Compute the fraction of the scores that exceed each threshold."""
-    count_at_or_below = np.sort(scores).searchsorted(thresholds, "right")
-    return (len(scores) - count_at_or_below) / len(scores)

@@ -7,7 +7,7 @@ name of a positive class. An image is a positive if it shows this class, and oth
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property, partial
 from typing import Any
 
@@ -17,7 +17,7 @@ from renderer.errors import ShortRepr
 from train.results import intervals
 from train.results.intervals import RATES, Jackknife, Units, leave_out
 from train.results.predictions import Predictions, as_column
-from train.results.tables import IMAGES, OBJECTS, THESE_OBJECTS, Estimate, Proportion, fraction
+from train.results.tables import IMAGES, OBJECTS, THESE_OBJECTS, Estimate, Proportion
 
 # Names of the metrics that depend on the ranking of the images, in the order in which
 # `auc_and_recalls` returns them.
@@ -171,13 +171,7 @@ class Outcome:
     @cached_property
     def proportion(self) -> Proportion:
         """Fraction of hits with its 95% interval, which is Wilson's if no unit is repeated."""
-        proportion = fraction(int(self.hits.sum()), len(self.hits))
-        if proportion.value is None:
-            return proportion
-        if self.jackknife.unit_count == proportion.n:
-            return replace(proportion, over=self.jackknife.over)
-        ends = self.jackknife.estimate
-        return replace(proportion, low=ends.low, high=ends.high, over=ends.over)
+        return self.jackknife.proportion(self.hits) if len(self.hits) else Proportion()
 
     @cached_property
     def jackknife(self) -> Jackknife:

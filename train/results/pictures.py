@@ -68,10 +68,6 @@ LEGEND = (
     "Under each image: the predicted class and its probability. "
     "If the prediction is wrong, the true class follows in gray."
 )
-# Colors of the frames: true positives, false negatives and false positives.
-GREEN = "#2e9e5b"
-RED = "#d03b3b"
-YELLOW = "#e8a317"
 
 Item = TypeVar("Item")
 # Data of one ROC curve: the log-odds of the positives, shape (n,), and of the
@@ -218,12 +214,11 @@ def _plot(draw: Callable[["Axes"], None], title: str, alt: str) -> Picture:
 
 
 def encode_picture(image: Image.Image, alt: str, caption: str = "") -> Picture:
-    """Encode an image for a page: a small image as PNG, a larger one as JPEG."""
-    if max(image.size) <= SMALL:
-        content = encode_image(image, "PNG", optimize=True)
-        return Picture(content, "png", alt, image.width, caption)
-    content = encode_image(image.convert("RGB"), "JPEG", optimize=True, quality=82)
-    return Picture(content, "jpeg", alt, image.width, caption)
+    """Encode an RGB image for a page: a small image as PNG, a larger one as JPEG."""
+    kind = "png" if max(image.size) <= SMALL else "jpeg"
+    # The quality is that of JPEG.
+    content = encode_image(image, kind.upper(), optimize=True, quality=82)
+    return Picture(content, kind, alt, image.width, caption)
 
 
 def read_square(path: Path, side: int, alt: str, caption: str = "") -> Picture:
@@ -260,10 +255,11 @@ def contact_sheet(predictions: Predictions, images: UInt8[np.ndarray, "N 3 H W"]
         order = np.argsort(-rows.probability, kind="stable")
         is_positive = rows.positive[order]
         is_found = rows.predicted[order] == label
+        # The frames are green, red and yellow.
         for name, color, is_shown, is_of_kind in (
-            ("true positives", GREEN, is_positive & is_found, is_positive),
-            ("false negatives", RED, is_positive & ~is_found, is_positive),
-            ("false positives", YELLOW, ~is_positive & is_found, ~is_positive),
+            ("true positives", "#2e9e5b", is_positive & is_found, is_positive),
+            ("false negatives", "#d03b3b", is_positive & ~is_found, is_positive),
+            ("false positives", "#e8a317", ~is_positive & is_found, ~is_positive),
         ):
             count = is_shown.sum()
             limit = f" ({MAX_IMAGES} shown, evenly by probability)" if count > MAX_IMAGES else ""

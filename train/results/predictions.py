@@ -36,6 +36,8 @@ SWEEP_FIGURE = "sweep.png"
 # name, and no name can make them equal to these.
 TRUE_PROBABILITY = "probability_of_true"
 TRUE_RANK = "rank_of_true"
+# Ends of the names of the columns of a positive class, by the attribute of `Predictions`.
+OF_LABEL = {"label_probability": "probability", "label_rank": "rank", "log_odds": "log_odds"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -78,7 +80,7 @@ class Predictions(ShortRepr):
         columns = {name: np.tile(as_column(shared[name]), len(by_label)) for name in shared}
         columns["label"] = as_column([*by_label]).repeat(len(shared["photograph"]))
         # Rows of the first class come first, and then those of the next classes.
-        for name in ("label_probability", "label_rank", "log_odds"):
+        for name in OF_LABEL:
             columns[name] = np.concatenate([of_label[name] for of_label in by_label.values()])
         return cls(**columns)
 
@@ -143,9 +145,8 @@ def write_predictions(path: Path, predictions: Predictions) -> None:
         TRUE_RANK: ["" if np.isinf(rank) else int(rank) for rank in first.true_rank.tolist()],
     }
     for label, rows in by_label.items():
-        columns[f"{label}_probability"] = rows.label_probability.tolist()
-        columns[f"{label}_rank"] = rows.label_rank.tolist()
-        columns[f"{label}_log_odds"] = rows.log_odds.tolist()
+        for name, end in OF_LABEL.items():
+            columns[f"{label}_{end}"] = getattr(rows, name).tolist()
     write_csv(path, [columns, *zip(*columns.values(), strict=True)])
 
 
@@ -185,11 +186,7 @@ def read_predictions(path: Path, label: str | Sequence[str]) -> Predictions:
             "true_rank": numbers(TRUE_RANK, "inf"),
         }
         by_label = {
-            name: {
-                "label_probability": numbers(f"{name}_probability"),
-                "label_rank": [int(row[f"{name}_rank"]) for row in rows],
-                "log_odds": numbers(f"{name}_log_odds"),
-            }
-            for name in label_names(label)
+            one: {name: numbers(f"{one}_{end}") for name, end in OF_LABEL.items()}
+            for one in label_names(label)
         }
         return Predictions.of_labels(shared, by_label)

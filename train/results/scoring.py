@@ -132,9 +132,6 @@ def compute_logits(
     and the model gets them in [0, 1]. The logits are on the CPU, and raise InputError if they are
     not finite.
     """
-    if classes < 2:
-        fault = "the model has a single class, so its log-odds are infinite"
-        raise InputError(f"{fault}: evaluate a model with at least two classes")
     checked = CheckedNetwork(model, "model", Classification(), classes)
     logits = compute_outputs(checked, images, BATCH, device).cpu()
     if not logits.isfinite().all():
@@ -329,8 +326,7 @@ def score(
     if by == "mesh" and not any(item.mesh for item in predicted.predictions.photograph):
         fault = f"by=mesh, but {predicted.folder} has no {TABLE} with a column mesh"
         raise InputError(f"{fault}: add this table, or remove by=mesh")
-    thresholds_by_label = {point.label: point.threshold for point in points}
-    pooled = Pooled(predicted.predictions, thresholds=thresholds_by_label)
+    pooled = Pooled(predicted.predictions, {point.label: point.threshold for point in points})
     return Scores(predicted, pooled, points, by)
 
 
@@ -348,11 +344,10 @@ def write(scores: Scores, out: Path) -> None:
     predictions.write_predictions(out / predictions.PREDICTIONS, predicted.predictions)
     sheet = contact_sheet(predicted.predictions, predicted.images.numpy())
     write_image(out / predictions.CONTACT_SHEET, sheet)
-    pooled = scores.pooled
-    groups = pooled.by_label if len(predicted.labels) > 1 else pooled.by_source
+    groups = scores.pooled.groups("label" if len(predicted.labels) > 1 else "source")
     # The log-odds of positives and negatives of each group.
     curves = {name: pool.scores for name, pool in groups.items()}
-    write_roc(out, pooled.all.scores, curves, scores.label)
+    write_roc(out, scores.pooled.all.scores, curves, scores.label)
     predictions.write_summary(out, scores.to_summary())
 
 

@@ -114,16 +114,11 @@ def as_text(value: object) -> str:
     Integers get thousands separators, such as "1,000". Floats that round to less than 1000 get
     three significant digits. None becomes an empty text.
     """
-    match value:
-        case None:
-            return ""
-        case float() if abs(value) >= 999.5:
-            return f"{value:,.0f}"
-        case float():
-            return f"{value:.3g}"
-        case int():
-            return f"{value:,}"
-    return str(value)
+    if value is None:
+        return ""
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 999.5 else f"{value:.3g}"
+    return f"{value:,}" if isinstance(value, int) else str(value)
 
 
 def join_words(items: Sequence[str], conjunction: str) -> str:
