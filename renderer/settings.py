@@ -239,8 +239,7 @@ def _check_value(name: str, value: Any, facts: Facts) -> None:
     if facts.is_filled and not value:
         raise InputError(f"{name} must not be empty: name one or more", name)
     if facts.is_pair:
-        lower = -math.inf if facts.minimum is None else facts.minimum
-        upper = math.inf if facts.maximum is None else facts.maximum
+        lower, upper = cast(tuple[float, float], (facts.minimum, facts.maximum))
         if len(value) != 2 or not lower <= value[0] <= value[1] <= upper:
             expected = f"give [minimum, maximum] from {lower:g} to {upper:g}"
             raise InputError(f"{name}={list(value)}: {expected}", name)
