@@ -174,8 +174,8 @@ def fit_scene(
         >>> mask = 1 - nb.render(mesh, camera, 0 * light, size=32, background=1.0)[0]
         >>> found = nb.fit_scene(photograph, mask, mesh)  # doctest: +SKIP
     """
-    photograph = as_tensor("photograph", photograph)
-    mask = as_tensor("mask", mask)
+    photograph = as_tensor("photograph", photograph).double()
+    mask = as_tensor("mask", mask).double()
     for name, values in (("photograph", photograph), ("mask", mask)):
         if not (values.min() >= 0 and values.max() <= 1):
             raise InputError(f"{name} has values outside [0, 1]: divide bytes by 255")
@@ -190,13 +190,12 @@ def fit_scene(
     # Arguments of `render` and `precompute_transfer` for all images that are compared.
     surface = {"albedo_scale": albedo_scale, "encoding": encoding, "normals": normals}
     options: dict[str, Any] = {**surface, "rasterizer": rasterizer, "samples": SAMPLES}
-    photograph = photograph.double()
-    mask = mask.double()
     target = _Target.from_photograph(photograph, mask, mesh, size, options)
     if start is not None and fov is not None:
         raise InputError(f"fov={fov} does not change the camera start: leave one of them out")
-    starts = [start.fixed()] if start else []
-    if start is None:
+    if start is not None:
+        starts = [start.fixed()]
+    else:
         # A search in a small copy of the photograph is faster.
         coarse_size = min(COARSE_SIZE, size)
         coarse_target = _Target.from_photograph(photograph, mask, mesh, coarse_size, options)
