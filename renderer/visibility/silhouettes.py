@@ -31,7 +31,7 @@ proportional to the depth, and 1 without perspective.
 from __future__ import annotations
 
 import math
-from dataclasses import InitVar, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -111,8 +111,8 @@ def moving_outlines(
     indices = torch.arange(len(fragments.sample_numbers), dtype=torch.int32, device=vertices.device)
     # Index of each sample of the image among the covered samples, or NOT_COVERED.
     sample_grid = fragments.image_of_samples(indices, NOT_COVERED)
-    places = positions.detach(), nearness.detach()
-    silhouettes = _Silhouettes(fragments, *places, faces, sample_grid)
+    points = torch.cat([positions[:, :2] / positions[:, 2:], nearness[:, None]], dim=1).detach()
+    silhouettes = _Silhouettes(fragments, points, faces, sample_grid)
     # Those in rows come first.
     both = zip(silhouettes.crossings_along(X), silhouettes.crossings_along(Y), strict=True)
     crossings = Crossings(*(torch.cat(pair, dim=-1) for pair in both))
@@ -315,7 +315,6 @@ def _pixels_of_cells(cells: Tensor, fragments: Fragments) -> Tensor:
     return pixel_row * width + cells % (width * samples) // samples
 
 
-@dataclass(eq=False, repr=False)
 class _Silhouettes:
     """Silhouette edges of a view, which may be hidden.
 
@@ -325,23 +324,18 @@ class _Silhouettes:
     normal in the image.
     """
 
-    fragments: Fragments
-    positions: InitVar[Float[Tensor, "V 3"]]
-    nearness: Float[Tensor, " V"]
-    faces: InitVar[Int[np.ndarray, "F 3"]]
-    sample_grid: Int[Tensor, "_ _"]
-
-    def __post_init__(self, positions: Tensor, faces: np.ndarray) -> None:
-        """Find the silhouette edges, from homogeneous positions."""
-        nearness = self.nearness
-        x, y, w = positions.T
-        points = torch.stack([x / w, y / w, nearness], dim=1)
+    def __init__(
+        self, fragments: Fragments, points: Tensor, faces: np.ndarray, sample_grid: Tensor
+    ) -> None:
+        """Find the silhouette edges. Points have an image position and a nearness, (V, 3)."""
+        self.fragments, self.sample_grid = fragments, sample_grid
+        self.nearness = nearness = points[:, 2]
         # Positions are rounded to subsamples as in rasterizers.
-        rows, columns = self.sample_grid.shape
+        rows, columns = sample_grid.shape
         self.places = to_fixed_point(points, (rows, columns))[0].T.double() / SUBSAMPLES
         key = np.ascontiguousarray(faces, dtype=np.int64).tobytes()
-        all_ends, edge_of_side, direction, face_count = _edges(key, positions.device)
-        corners = torch.from_numpy(faces).to(positions.device).T
+        all_ends, edge_of_side, direction, face_count = _edges(key, points.device)
+        corners = torch.from_numpy(faces).to(points.device).T
         orientation = doubled_areas(self.places[:, corners]).sign()
         # One number for each face and each of its three edges: 1 if the face lies on one side of
         # the edge, and -1 if it lies on the other side. An edge leads to its higher vertex index.
@@ -352,7 +346,7 @@ class _Silhouettes:
         self.ends = all_ends[:, side_sums.abs() > face_count - 2]
         # Vertices that no face uses do not count.
         self.nearness_range = nearness[all_ends].max() - nearness[all_ends].min()
-        if len(self.fragments.sample_to_seen_face) == 0:
+        if len(fragments.sample_to_seen_face) == 0:
             self.ends = self.ends[:, :0]  # If no sample shows the mesh, no silhouette is visible.
         # An edge (a, b) with y down has the normal (b, a) with y up.
         normal = self.places[:, self.ends].diff(dim=1)[:, 0].flip(0)
