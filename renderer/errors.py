@@ -352,8 +352,7 @@ def as_list(name: str, value: object, kind: Any, expected: str) -> list[Any]:
         raise InputError(f"{name} is {describe(value)}: give {expected}", name)
     items = list(value)
     for index, item in enumerate(items):
-        if not isinstance(item, kind):
-            raise InputError(f"{name}[{index}] is {describe(item)}: give {expected}", name)
+        require_kind(f"{name}[{index}]", item, kind, expected)
     return items
 
 
