@@ -307,9 +307,8 @@ def _groups_of_file(
     pairs = np.concatenate([pairs, in_order[:, is_same_vertex]], axis=1)
     agree = _are_similar(unit_normals, pairs, FILE_ANGLE)
     count = vertex.max() + 1
-    edges, counts = np.unique(
-        vertex * count + np.roll(faces, -1, axis=1).ravel(), return_counts=True
-    )
+    directed_edges = vertex * count + np.roll(faces, -1, axis=1).ravel()
+    edges, counts = np.unique(directed_edges, return_counts=True)
     is_mixed = np.isin(np.arange(count), np.divmod(edges[counts > 1], count))
     agree &= ~is_mixed[vertex[pairs[0]]] | (side[pairs].prod(axis=0) > 0)
     return _joined(faces, pairs[:, agree]), is_given
