@@ -239,17 +239,18 @@ class Fragments:
 
     def distribute(
         self, values: Float[Tensor, "N D"], samples: Int[Tensor, " N"]
-    ) -> Float[Tensor, "G 3 D"]:
+    ) -> Float[Tensor, "D _"]:
         """Add up values at N of the samples for each corner of the faces that the samples show.
 
         Each value is multiplied by the barycentric weight of the corner at the
-        sample. This is the transpose of `interpolate`, as in backpropagation.
+        sample. This is the transpose of `interpolate`, as in backpropagation. The columns are all
+        first corners of the G seen faces, then all second and all third corners.
         """
         seen_face = self.sample_to_seen_face.index_select(0, samples)
         shape = (3 * values.shape[1], len(self.faces))
         corner_rows = _distribute(values.T, seen_face, self.barycentric[samples].T, shape)
-        # The axes corner, value, seen face become seen face, corner, value.
-        return corner_rows.unflatten(0, (3, -1)).permute(2, 0, 1)
+        # The axes corner, value, seen face become value, corner and seen face.
+        return corner_rows.unflatten(0, (3, -1)).transpose(0, 1).flatten(1)
 
     def merge(self, albedo: Float[Tensor, "S C"]) -> Float[Tensor, "R C"]:
         """Add up the albedo of each of the R `groups`, divided by the samples of a pixel.

@@ -204,8 +204,7 @@ class _MovingView:
             sample_gradients = _to_homogeneous(sample_gradients, places, depth)
         # Distribute the gradients to the corners of faces: one row for each coordinate, one
         # column for each corner.
-        corner_gradients = fragments.distribute(sample_gradients, samples)
-        corner_gradients = corner_gradients.permute(2, 1, 0).flatten(1).double()
+        corner_gradients = fragments.distribute(sample_gradients, samples).double()
         gradient = positions.new_zeros(positions.shape[::-1])
         # Without perspective, only the first two coordinates have a gradient.
         coordinate_count = sample_gradients.shape[1]
