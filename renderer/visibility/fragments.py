@@ -377,15 +377,14 @@ def samples_on_gpu(device: torch.device) -> int:
     return int(MEMORY_FRACTION * memory / SAMPLE_BYTES)
 
 
-def views_at_once(settings: ImageSettings, vertices: np.ndarray | Tensor, casts_rays: bool) -> int:
+def views_at_once(settings: ImageSettings, device: torch.device, casts_rays: bool) -> int:
     """Return how many views are shaded at once. Few samples take as long as many.
 
     Rays need single views.
     """
     if casts_rays:
         return 1
-    is_on_gpu = isinstance(vertices, Tensor) and vertices.is_cuda
-    samples = samples_on_gpu(vertices.device) if is_on_gpu else SAMPLES_ON_CPU
+    samples = samples_on_gpu(device) if device.type == "cuda" else SAMPLES_ON_CPU
     return max(1, samples // (settings.pixel_count * settings.samples**2))
 
 
