@@ -326,9 +326,8 @@ class _Target:
 
     def rank_cameras(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
         """Sort cameras by the squared error of a render with their best light, smallest first."""
-        cameras = list(cameras)
-        errors = [float(self.fit_light(one)[0].square().sum()) for one in cameras]
-        return sorted(zip(errors, cameras, strict=True), key=lambda pair: pair[0])
+        pairs = [(float(self.fit_light(one)[0].square().sum()), one) for one in cameras]
+        return sorted(pairs, key=lambda pair: pair[0])
 
     def penalty(self, normal_matrix: Float[Tensor, "3 49 49"]) -> Float[Tensor, " 49"]:
         """Compute the weights of the smoothness penalty of a light.
