@@ -296,8 +296,7 @@ class _Target:
         # Radiance of the P covered pixels under each of the 49 lights, shape (3, 49, P).
         transfer = operator.radiance(unit_lights).permute(1, 0, 2)
         pixels = operator.pixels
-        no_coverage = self.mask.new_zeros(self.size**2)
-        coverage = no_coverage.index_copy(0, pixels, operator.coverage.double())
+        coverage = torch.zeros_like(self.mask).index_copy(0, pixels, operator.coverage.double())
         background = self.gray * (1 - coverage)
         image = self.image[:, pixels]
         covered_share = torch.minimum(coverage, self.mask)[pixels]
