@@ -292,13 +292,17 @@ class Mesh:
 def _closed_parts(face_bytes: bytes) -> Int[np.ndarray, " F"] | None:
     """Find the connected part of each face. None if one is open or has mixed orientations."""
     # trimesh is imported here because the import takes half a second.
-    from trimesh.graph import connected_component_labels, face_adjacency, is_watertight
+    from trimesh.graph import connected_component_labels
+    from trimesh.grouping import group_rows
 
     faces = np.frombuffer(face_bytes, dtype=np.int64).reshape(-1, 3)
+    # Side s of face f has the number 3 f + s.
+    sides = faces[:, EDGES].reshape(-1, 2)
     # Each edge of a closed surface has two sides, one in each direction.
-    if not all(is_watertight(faces[:, EDGES].reshape(-1, 2))):
+    pairs = group_rows(np.sort(sides, axis=1), require_count=2)
+    if 2 * len(pairs) < len(sides) or (sides[pairs[:, 0]] != sides[pairs[:, 1], ::-1]).any():
         return None
-    return connected_component_labels(face_adjacency(faces), node_count=len(faces))
+    return connected_component_labels(pairs // 3, node_count=len(faces))
 
 
 def require_mesh(name: str, value: object) -> None:
