@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
+import renderer.visibility.numpy as exact
 from renderer.errors import import_package
-from renderer.visibility import numpy as exact
 from renderer.visibility.numpy import FAR, SUBSAMPLE_BITS, FaceIds, Faces, Views, to_fixed_point
 
 # numba also raises ImportError for an unsupported NumPy.
@@ -81,18 +81,6 @@ def _covered_range(coordinates: Any, a: int, b: int, c: int, count: int) -> tupl
 
 
 @_njit
-def _sort_downward(ax: int, ay: int, bx: int, by: int, cx: int, cy: int) -> Any:
-    """Sort three corners by y, which points down: x and y of the top, middle and bottom corner."""
-    if ay > by:
-        ax, ay, bx, by = bx, by, ax, ay
-    if by > cy:
-        bx, by, cx, cy = cx, cy, bx, by
-    if ay > by:
-        ax, ay, bx, by = bx, by, ax, ay
-    return ax, ay, bx, by, cx, cy
-
-
-@_njit
 def _crossing(x: int, y: int, to_x: int, to_y: int, row_y: int) -> int:
     """Find the first column of samples at or after the point at which a row crosses an edge.
 
@@ -128,7 +116,14 @@ def _draw(positions: Any, depths: Any, faces: Any, closed: bool, ids: Any, neare
         plane = _depth_plane(triangle, (depths[a], depths[b], depths[c]), _doubled_area(triangle))
         # Position and depth of the corner a, and slopes of the depth, in samples.
         first_column, first_row, depth_a, slope_x, slope_y = plane
-        ax, ay, bx, by, cx, cy = _sort_downward(x[a], y[a], x[b], y[b], x[c], y[c])
+        # From here on, a is the top corner and c the bottom corner. y points down.
+        if y[a] > y[b]:
+            a, b = b, a
+        if y[b] > y[c]:
+            b, c = c, b
+        if y[a] > y[b]:
+            a, b = b, a
+        ax, ay, bx, by, cx, cy = x[a], y[a], x[b], y[b], x[c], y[c]
         for row in range(top, bottom):
             row_y = row << SUBSAMPLE_BITS
             row_depth = depth_a + (row - first_row) * slope_y
