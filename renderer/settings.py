@@ -150,7 +150,7 @@ def _field(default: Any, facts: Facts) -> Any:
     """Create a field of a dataclass, and store facts about the field in its metadata."""
     metadata = {"facts": facts}
     if isinstance(default, list | dict):
-        return field(default_factory=partial(deepcopy, default), metadata=metadata)
+        default = partial(deepcopy, default)
     if callable(default):
         return field(default_factory=default, metadata=metadata)
     return field(default=default, metadata=metadata)
