@@ -226,7 +226,8 @@ class _MovingView:
         grid = self.sample_grid
         # `gradient_of_silhouettes` computes the gradient where a silhouette passes between samples.
         is_along_axis = self.crossings.horizontal if axis == X else ~self.crossings.horizontal
-        crossed = list(torch.unravel_index(self.crossings.cells[0, is_along_axis], grid.shape))
+        cells = self.crossings.cells[0, is_along_axis]
+        crossed = [cells // grid.shape[1], cells % grid.shape[1]]
         if axis == Y:
             # Make rows of the image of its columns.
             weighted_image, grid = weighted_image.T, grid.T
