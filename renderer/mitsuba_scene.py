@@ -121,14 +121,10 @@ def render_mitsuba_scene(path: Path, views: int, shape: tuple[int, int]) -> torc
     with mitsuba() as module, reading(path, "cannot be rendered by Mitsuba"):
         scene = module.load_file(str(path))
         rendered = [np.array(module.render(scene, sensor=view)) for view in range(views)]
-    images = []
-    for image in rendered:
-        channels = torch.from_numpy(image).permute(2, 0, 1)
-        if channels.shape[1:] != shape:
-            # Mitsuba's pixels are square. Those of the camera are not.
-            [channels] = F.interpolate(channels[None], shape, mode="bilinear", antialias=True)
-        images.append(channels)
-    return torch.stack(images)
+    images = [torch.from_numpy(image).permute(2, 0, 1)[None] for image in rendered]
+    # Mitsuba's pixels are square. Those of the camera may have another aspect ratio.
+    resized = [F.interpolate(one, shape, mode="bilinear", antialias=True) for one in images]
+    return torch.cat(resized)
 
 
 def mitsuba_map(coefficients: torch.Tensor, height: int) -> torch.Tensor:
