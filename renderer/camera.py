@@ -26,6 +26,8 @@ Points = TypeVar("Points", np.ndarray, Tensor)
 CLIP_RANGE = 2.0
 # Largest polar angle, roll and first azimuth of an orbit in degrees: two turns.
 MAX_TURN = 720.0
+# One degree in radians.
+DEGREE = math.pi / 180
 # Limits of the field of view in degrees, for the cameras of an orbit and for projectors.
 MIN_FOV = 0.05
 MAX_FOV = 172.0
@@ -290,7 +292,7 @@ class Camera(ABC):
     def _camera_coordinates(self, points: Float[Tensor, "V 3"]) -> Float[Tensor, "3 V"]:
         """Convert points to the axes right, up and back of the camera, from the pivot."""
         angles = (self.polar, self.azimuth, self.roll)
-        polar, azimuth, roll = (tensor_like(in_radians(angle), points) for angle in angles)
+        polar, azimuth, roll = (tensor_like(angle * DEGREE, points) for angle in angles)
         center = [self.center_x, self.center_y, self.center_z]
         pivot = torch.stack([tensor_like(coordinate, points) for coordinate in center])
         # Axes right, up and back in world coordinates, without roll.
@@ -490,13 +492,6 @@ def _like(array: np.ndarray, points: Points) -> Points:
 def tensor_like(value: float | Tensor, like: Tensor) -> Tensor:
     """Convert a number or a tensor to a tensor with the dtype and the device of `like`."""
     return torch.as_tensor(value, dtype=like.dtype, device=like.device)
-
-
-def in_radians(degrees: Any) -> Any:
-    """Convert an angle, which is a number or a tensor, from degrees to radians."""
-    if isinstance(degrees, Tensor):
-        return torch.deg2rad(degrees)
-    return math.radians(degrees)
 
 
 def orbit_cameras(

@@ -15,7 +15,7 @@ import reprlib
 import textwrap
 import unicodedata
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Set
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import fields, is_dataclass
 from numbers import Integral, Real
@@ -192,26 +192,23 @@ def require_file(path: str | Path, advice: str) -> None:
 
 def require_range(name: str, value: float | None, least: float, most: float) -> None:
     """Check that a value is None or a number in a range, which NaN never is."""
-    if value is None:
-        return
-    if not is_number(value):
-        raise InputError(f"{name}={_short_text(value)} must be a number", name)
-    if not least <= value <= most:
-        raise InputError(f"{name}={value} must be at least {least:g} and at most {most:g}", name)
+    if value is not None:
+        require_number(name, value, least, most)
 
 
-def require_number(name: str, value: object, least: float, most: float) -> None:
+def require_number(name: str, value: Any, least: float, most: float) -> None:
     """Check that a value is a number in a range. Unlike `require_range`, it refuses None."""
     if not is_number(value):
         raise InputError(f"{name} is {describe(value)}: give a number", name)
-    require_range(name, cast(float, value), least, most)
+    if not least <= value <= most:
+        raise InputError(f"{name}={value} must be at least {least:g} and at most {most:g}", name)
 
 
 def require_whole(name: str, value: object, least: float = 0, most: float = MAX_SEED) -> None:
     """Check that a value is a whole number, which True and 1.0 are not, in a range."""
     if not is_whole(value):
         raise InputError(f"{name} is {describe(value)}: give a whole number", name)
-    require_range(name, cast(int, value), least, most)
+    require_number(name, value, least, most)
 
 
 def require_choice(name: str, value: object, choices: Collection[str]) -> None:
@@ -264,9 +261,8 @@ def as_tensor(name: str, value: object) -> Tensor:
     elif is_sequence and all(isinstance(item, torch.Tensor) for item in cast(Any, value)):
         # Tensors are stacked in the dtype and on the device of the first.
         rows = [as_tensor(name, item) for item in cast(Any, value)]
-        first = rows[0]
-        if all(row.shape == first.shape for row in rows):
-            return torch.stack([row.to(first) for row in rows])
+        if all(row.shape == rows[0].shape for row in rows):
+            return torch.stack([row.to(rows[0]) for row in rows])
     else:
         array = _as_numbers(value)
         if array is not None:
@@ -356,8 +352,7 @@ def as_list(name: str, value: object, kind: Any, expected: str) -> list[Any]:
         raise InputError(f"{name} is {describe(value)}: give {expected}", name)
     items = list(value)
     for index, item in enumerate(items):
-        if not isinstance(item, kind):
-            raise InputError(f"{name}[{index}] is {describe(item)}: give {expected}", name)
+        require_kind(f"{name}[{index}]", item, kind, expected)
     return items
 
 
@@ -374,12 +369,11 @@ def require_shape(name: str, values: Any, *expected: int | str) -> None:
     """
     shape = tuple(values.shape)
     # With "...", only the last dimensions are compared.
-    sizes = expected[1:] if expected[0] == "..." else expected
-    checked = shape[-len(sizes) :] if expected[0] == "..." else shape
-    if len(checked) != len(sizes) or any(
-        isinstance(size, int) and size != given for size, given in zip(sizes, checked, strict=True)
+    sizes = (*shape[: 1 - len(expected)], *expected[1:]) if expected[0] == "..." else expected
+    if len(shape) != len(sizes) or any(
+        isinstance(size, int) and size != given for size, given in zip(sizes, shape, strict=True)
     ):
-        wanted = f"({', '.join(map(str, expected))}{',' if len(expected) == 1 else ''})"
+        wanted = str(expected).replace("'", "")
         raise InputError(f"{name} has shape {shape}: give {wanted}", name)
 
 
@@ -407,9 +401,8 @@ def is_number(value: object) -> bool:
 
 def is_flag(value: object) -> bool:
     """Tell whether a value is True, False, 1 or 0."""
-    if type(value).__module__ == "numpy" and getattr(value, "shape", None) == ():
-        value = value.item()  # type: ignore[attr-defined]
-    return isinstance(value, bool) or (is_whole(value) and value in (0, 1))
+    # NumPy calls its class of flags `bool`, too.
+    return type(value).__name__ == "bool" or (is_whole(value) and value in (0, 1))
 
 
 def describe(value: Any) -> str:
@@ -558,11 +551,9 @@ def free_memory(device: torch.device) -> int | None:
         free = 1024 * int(lines["MemAvailable"].split()[0])
     except (OSError, KeyError, ValueError):
         return None
-    try:
-        limit = int((GROUP / "memory.max").read_text())
-        used = int((GROUP / "memory.current").read_text())
     # Outside of a container, the files do not exist. A container without a limit has the text
     # "max" in the first file, which is not a number.
-    except (OSError, ValueError):
-        return free
-    return min(free, limit - used)
+    with suppress(OSError, ValueError):
+        limit, used = (int((GROUP / f"memory.{name}").read_text()) for name in ("max", "current"))
+        free = min(free, limit - used)
+    return free

@@ -174,8 +174,8 @@ def fit_scene(
         >>> mask = 1 - nb.render(mesh, camera, 0 * light, size=32, background=1.0)[0]
         >>> found = nb.fit_scene(photograph, mask, mesh)  # doctest: +SKIP
     """
-    photograph = as_tensor("photograph", photograph)
-    mask = as_tensor("mask", mask)
+    photograph = as_tensor("photograph", photograph).double()
+    mask = as_tensor("mask", mask).double()
     for name, values in (("photograph", photograph), ("mask", mask)):
         if not (values.min() >= 0 and values.max() <= 1):
             raise InputError(f"{name} has values outside [0, 1]: divide bytes by 255")
@@ -190,20 +190,20 @@ def fit_scene(
     # Arguments of `render` and `precompute_transfer` for all images that are compared.
     surface = {"albedo_scale": albedo_scale, "encoding": encoding, "normals": normals}
     options: dict[str, Any] = {**surface, "rasterizer": rasterizer, "samples": SAMPLES}
-    photograph = photograph.double()
-    mask = mask.double()
-    target = _Target.from_photograph(photograph, mask, mesh, size, options)
+    target = _Target(photograph, mask, mesh, size, options)
     if start is not None and fov is not None:
         raise InputError(f"fov={fov} does not change the camera start: leave one of them out")
-    starts = [start.fixed()] if start else []
-    if start is None:
+    if start is not None:
+        starts = [start.fixed()]
+    else:
         # A search in a small copy of the photograph is faster.
         coarse_size = min(COARSE_SIZE, size)
-        coarse_target = _Target.from_photograph(photograph, mask, mesh, coarse_size, options)
+        coarse_target = _Target(photograph, mask, mesh, coarse_size, options)
         starts = _plausible_cameras(coarse_target, mask, fov)
     _, camera = target.rank_cameras(target.refine_camera(camera) for camera in starts)[0]
     # Bounces are slow to compute, so only the returned light is fitted with bounces.
-    return target._replace(options={**options, "bounces": bounces}).fit_final_light(camera)
+    target.options = {**options, "bounces": bounces}
+    return target.fit_final_light(camera)
 
 
 def _plausible_cameras(
@@ -223,9 +223,7 @@ def _plausible_cameras(
     ranked_cameras = [camera for _, camera in target.rank_cameras(first_cameras)]
     # All azimuths fit a round object equally well, so the best cameras may all have the same polar
     # angle. The best camera of each polar angle is therefore refined, too.
-    best_of_polar: dict[float, Camera] = {}
-    for camera in ranked_cameras:
-        best_of_polar.setdefault(camera.polar, camera)
+    best_of_polar = {camera.polar: camera for camera in reversed(ranked_cameras)}
     # dict.fromkeys removes duplicates, and keeps the order.
     start_cameras = dict.fromkeys([*ranked_cameras[:KEPT_CAMERAS], *best_of_polar.values()])
     refined = target.rank_cameras(target.refine_camera(camera) for camera in start_cameras)
@@ -240,28 +238,21 @@ def _plausible_cameras(
     return kept[:KEPT_CAMERAS]
 
 
-class _Target(NamedTuple):
+class _Target:
     """Photograph of an object that renders of a mesh should resemble.
 
     Pixels of `image` (linear) outside of the object have the value `gray`, 0 or 1. `mask` is
     the share of each pixel that the object covers. Meshes are rendered with `options`.
     """
 
-    image: Float[Tensor, "3 P"]
-    mask: Float[Tensor, " P"]
-    gray: float
-    mesh: Mesh
-    size: int
-    options: dict[str, Any]
-
-    @staticmethod
-    def from_photograph(
+    def __init__(
+        self,
         photograph: Float[Tensor, "3 H H"],
         mask: Float[Tensor, "H H"],
         mesh: Mesh,
         size: int,
         options: dict[str, Any],
-    ) -> _Target:
+    ) -> None:
         """Resample a photograph and its mask, and replace the background by black or white.
 
         Pixels on the border of the object show a mixture of object and
@@ -278,12 +269,14 @@ class _Target(NamedTuple):
         border_color = mean_color / inside_fraction.clamp(min=1e-9)
         color = torch.where(inside_mask > 0, photograph, border_color)
         object_image = F.interpolate((color * mask)[None], (size, size), mode="area")[0]
-        mask = F.interpolate(mask[None][None], (size, size), mode="area")[0]
+        covered = F.interpolate(mask[None][None], (size, size), mode="area")[0]
         # The background becomes black behind a bright object, and white behind a dark one, so that
         # the silhouette stands out.
-        gray = 0.0 if float(object_image.sum()) > 0.5 * CHANNELS * float(mask.sum()) else 1.0
-        image = object_image + gray * (1 - mask)
-        return _Target(image.flatten(1), mask.flatten(), gray, mesh, size, options)
+        is_bright = float(object_image.sum()) > 0.5 * CHANNELS * float(covered.sum())
+        self.gray = 0.0 if is_bright else 1.0
+        self.image = (object_image + self.gray * (1 - covered)).flatten(1)
+        self.mask = covered.flatten()
+        self.mesh, self.size, self.options = mesh, size, options
 
     def fit_light(
         self, camera: Camera, min_coverage: float = 0.0, grid: int = SEARCH_GRID
@@ -303,8 +296,7 @@ class _Target(NamedTuple):
         # Radiance of the P covered pixels under each of the 49 lights, shape (3, 49, P).
         transfer = operator.radiance(unit_lights).permute(1, 0, 2)
         pixels = operator.pixels
-        no_coverage = self.mask.new_zeros(self.size**2)
-        coverage = no_coverage.index_copy(0, pixels, operator.coverage.double())
+        coverage = torch.zeros_like(self.mask).index_copy(0, pixels, operator.coverage.double())
         background = self.gray * (1 - coverage)
         image = self.image[:, pixels]
         covered_share = torch.minimum(coverage, self.mask)[pixels]
@@ -333,9 +325,8 @@ class _Target(NamedTuple):
 
     def rank_cameras(self, cameras: Iterable[Camera]) -> list[tuple[float, Camera]]:
         """Sort cameras by the squared error of a render with their best light, smallest first."""
-        cameras = list(cameras)
-        errors = [float(self.fit_light(one)[0].square().sum()) for one in cameras]
-        return sorted(zip(errors, cameras, strict=True), key=lambda pair: pair[0])
+        pairs = [(float(self.fit_light(one)[0].square().sum()), one) for one in cameras]
+        return sorted(pairs, key=lambda pair: pair[0])
 
     def penalty(self, normal_matrix: Float[Tensor, "3 49 49"]) -> Float[Tensor, " 49"]:
         """Compute the weights of the smoothness penalty of a light.

@@ -7,6 +7,7 @@ Linear RGB has the primaries of Rec. 709 with D65; `to_rec709` converts others.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -218,24 +219,18 @@ def to_rec709(chromaticities: Sequence[float], adapt: bool) -> Float[np.ndarray,
     # Files round chromaticities, so small differences from Rec. 709 do not count.
     if xy.shape == (8,) and np.abs(xy - REC_709).max() <= ROUNDING:
         return None
-    error = ValueError(f"the primaries {xy.tolist()} span no colors")
-    if np.abs(xy).max(initial=0) > LARGEST:
-        raise error
-    try:
-        # Matrices from linear RGB to the responses of the cones of the eye, for both kinds of
-        # primaries.
-        theirs = BRADFORD @ _to_xyz(xy)
-    except (ValueError, np.linalg.LinAlgError):
-        raise error from None
+    # Matrices from linear RGB to the responses of the eye's cones, for both kinds of primaries.
     ours = BRADFORD @ _to_xyz(np.array(REC_709))
-    if adapt:
-        # The sum over the primaries is the response of the cones to white.
-        theirs = np.diag(ours.sum(axis=1) / theirs.sum(axis=1)) @ theirs
-    matrix: np.ndarray = np.linalg.inv(ours) @ theirs
-    # Primaries that nearly lie on a line give huge numbers.
-    if not (np.abs(matrix) < 100).all():
-        raise error
-    return matrix
+    with suppress(ValueError, np.linalg.LinAlgError):
+        theirs = BRADFORD @ _to_xyz(xy)
+        if adapt:
+            # The sum over the primaries is the response of the cones to white.
+            theirs = np.diag(ours.sum(axis=1) / theirs.sum(axis=1)) @ theirs
+        matrix: np.ndarray = np.linalg.inv(ours) @ theirs
+        # Primaries that nearly lie on a line give huge numbers.
+        if np.abs(xy).max() <= LARGEST and (np.abs(matrix) < 100).all():
+            return matrix
+    raise ValueError(f"the primaries {xy.tolist()} span no colors")
 
 
 def _to_xyz(chromaticities: np.ndarray) -> np.ndarray:

@@ -130,14 +130,12 @@ class Mesh:
             # Arrays per face have as many rows as `faces`. Other arrays may have any number of
             # rows.
             shape = (*(self.faces if name in PER_FACE else array).shape[:1], *row)
-            if array.shape != shape:
-                errors.require_shape(name, array, *shape)
+            errors.require_shape(name, array, *shape)
         errors.require_range("the number of faces", len(self.faces), 1, np.inf)
         for name, channels in (("textures", 3), ("gloss_textures", 2)):
             expected = f"a list of arrays (height, width, {channels}) of uint8"
             given = errors.as_list(name, getattr(self, name), object, expected)
-            arrays = (errors.as_array(name, texture) for texture in given)
-            textures = tuple(np.asarray(texture, order="C") for texture in arrays)
+            textures = tuple(np.asarray(errors.as_array(name, item), order="C") for item in given)
             for texture in textures:
                 if texture.shape[2:] != (channels,) or texture.dtype != np.uint8:
                     raise InputError(f"{name} has {errors.describe(texture)}: give {expected}")
@@ -295,19 +293,16 @@ def _closed_parts(face_bytes: bytes) -> Int[np.ndarray, " F"] | None:
     """Find the connected part of each face. None if one is open or has mixed orientations."""
     # trimesh is imported here because the import takes half a second.
     from trimesh.graph import connected_component_labels
+    from trimesh.grouping import group_rows
 
     faces = np.frombuffer(face_bytes, dtype=np.int64).reshape(-1, 3)
-    _, edge_of_side = shared_edges(faces)
-    edges = edge_of_side.ravel()
-    starts, ends = faces[:, EDGES].reshape(-1, 2).T
-    # Each edge of a closed surface has one side in each direction.
-    directions = np.bincount(edges, np.sign(ends - starts))
-    if (np.bincount(edges) != 2).any() or directions.any():
-        return None
     # Side s of face f has the number 3 f + s.
-    # Sorted by edge, the two sides of each edge follow each other.
-    neighboring_faces = np.argsort(edges, kind="stable").reshape(-1, 2) // 3
-    return connected_component_labels(neighboring_faces, node_count=len(faces))
+    sides = faces[:, EDGES].reshape(-1, 2)
+    # Each edge of a closed surface has two sides, one in each direction.
+    pairs = group_rows(np.sort(sides, axis=1), require_count=2)
+    if 2 * len(pairs) < len(sides) or (sides[pairs[:, 0]] != sides[pairs[:, 1], ::-1]).any():
+        return None
+    return connected_component_labels(pairs // 3, node_count=len(faces))
 
 
 def require_mesh(name: str, value: object) -> None:
@@ -325,41 +320,37 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
 
     Vertices are not merged. Meshes that share a texture also share it in the result.
     """
-    faces, texture_ids, normal_ids = [], [], []
+    faces, texture_ids, normal_ids, gloss = [], [], [], []
     # The indices of a mesh grow by the numbers of vertices and normals before it.
     vertex_count = normal_count = 0
-    # Number of each pair of texture and gloss texture, by their identities.
-    numbers: dict[tuple[int, int], int] = {}
-    pairs: list[tuple[np.ndarray, np.ndarray]] = []
+    # Number of each pair of texture and gloss texture, and the pair, by their identities.
+    pairs: dict[tuple[int, int], tuple[int, np.ndarray, np.ndarray]] = {}
     for mesh in meshes:
         faces.append(mesh.faces + vertex_count)
         normal_ids.append(mesh.normal_ids + normal_count)
         vertex_count += len(mesh.vertices)
         normal_count += mesh.normal_ids.max() + 1
+        # A mesh without gloss is matte if another mesh has gloss.
+        gloss.append(_MATTE.repeat(len(mesh.faces), 0) if mesh.gloss is None else mesh.gloss)
         # The last entry belongs to the index -1, which is NO_TEXTURE.
         new_ids = [NO_TEXTURE]
         # A mesh without gloss textures has a factor of 1 for each of its textures.
         neutral = (_NEUTRAL_GLOSS,) * len(mesh.textures)
         for pair in zip(mesh.textures, mesh.gloss_textures or neutral, strict=True):
             key = (id(pair[0]), id(pair[1]))
-            if key not in numbers:
-                numbers[key] = len(pairs)
-                pairs.append(pair)
-            new_ids.insert(-1, numbers[key])
+            number, *_ = pairs.setdefault(key, (len(pairs), *pair))
+            new_ids.insert(-1, number)
         texture_ids.append(np.array(new_ids, dtype=np.int32)[mesh.texture_ids])
-    has_gloss_textures = any(mesh.gloss_textures for mesh in meshes)
-    # Rows of gloss for meshes without any, if another mesh has gloss.
-    matte = [_MATTE.repeat(len(mesh.faces), 0) for mesh in meshes]
-    gloss = [m if mesh.gloss is None else mesh.gloss for mesh, m in zip(meshes, matte, strict=True)]
+    has_factors = any(mesh.gloss_textures for mesh in meshes)
     return Mesh(
         vertices=np.concatenate([mesh.vertices for mesh in meshes]),
         faces=np.concatenate(faces),
         corner_colors=np.concatenate([mesh.corner_colors for mesh in meshes]),
         corner_uvs=np.concatenate([mesh.corner_uvs for mesh in meshes]),
         texture_ids=np.concatenate(texture_ids),
-        textures=tuple(pair[0] for pair in pairs),
+        textures=tuple(texture for _, texture, _ in pairs.values()),
         gloss=None if all(mesh.gloss is None for mesh in meshes) else np.concatenate(gloss),
-        gloss_textures=tuple(pair[1] for pair in pairs) if has_gloss_textures else (),
+        gloss_textures=tuple(factors for *_, factors in pairs.values()) if has_factors else (),
         normal_ids=np.concatenate(normal_ids),
     )
 
@@ -477,13 +468,10 @@ def refine(mesh: Mesh, area: float, encoding: str) -> Mesh:
     is_large = mesh.face_areas() > area
     if not is_large.any():
         return mesh
-    if is_large.all():
-        return refine(_quartered(mesh, encoding), area, encoding)
-    small_faces = select_faces(mesh, ~is_large)
     divided = refine(_quartered(select_faces(mesh, is_large), encoding), area, encoding)
     arrays: dict[str, Any] = {
-        name: np.concatenate([rows, getattr(divided, name)])
-        for name, rows in _rows_of_faces(small_faces).items()
+        name: np.concatenate([rows[~is_large], getattr(divided, name)])
+        for name, rows in _rows_of_faces(mesh).items()
     }
     # The divided mesh has all old vertices, so the vertex
     # indices of the small faces are valid in it, too.
@@ -492,11 +480,10 @@ def refine(mesh: Mesh, area: float, encoding: str) -> Mesh:
 
 def select_faces(mesh: Mesh, faces: np.ndarray | slice) -> Mesh:
     """Return a copy of a mesh with some faces (indices, mask or slice) and all of its vertices."""
-    rows: dict[str, Any] = _rows_of_faces(mesh)
-    return replace(mesh, **{name: values[faces] for name, values in rows.items()})
+    return replace(mesh, **{name: rows[faces] for name, rows in _rows_of_faces(mesh).items()})
 
 
-def _rows_of_faces(mesh: Mesh) -> dict[str, np.ndarray]:
+def _rows_of_faces(mesh: Mesh) -> dict[str, Any]:
     """Return the arrays of a mesh with one row for each face. A matte mesh has no gloss."""
     return {name: getattr(mesh, name) for name in PER_FACE if getattr(mesh, name) is not None}
 

@@ -121,14 +121,10 @@ def render_mitsuba_scene(path: Path, views: int, shape: tuple[int, int]) -> torc
     with mitsuba() as module, reading(path, "cannot be rendered by Mitsuba"):
         scene = module.load_file(str(path))
         rendered = [np.array(module.render(scene, sensor=view)) for view in range(views)]
-    images = []
-    for image in rendered:
-        channels = torch.from_numpy(image).permute(2, 0, 1)
-        if channels.shape[1:] != shape:
-            # Mitsuba's pixels are square. Those of the camera are not.
-            [channels] = F.interpolate(channels[None], shape, mode="bilinear", antialias=True)
-        images.append(channels)
-    return torch.stack(images)
+    images = [torch.from_numpy(image).permute(2, 0, 1)[None] for image in rendered]
+    # Mitsuba's pixels are square. Those of the camera may have another aspect ratio.
+    resized = [F.interpolate(one, shape, mode="bilinear", antialias=True) for one in images]
+    return torch.cat(resized)
 
 
 def mitsuba_map(coefficients: torch.Tensor, height: int) -> torch.Tensor:
@@ -175,7 +171,7 @@ class Part:
     factors: UInt8[np.ndarray, "_ _ 2"] | None = None
 
 
-def split_parts(mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], encoding: str) -> list[Part]:
+def split_parts(mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], encoding: str) -> Iterator[Part]:
     """Split a mesh into parts, each of which has one texture and one specular reflection.
 
     Mitsuba cannot multiply a texture by corner colors. If corners of faces with a
@@ -185,14 +181,13 @@ def split_parts(mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], encoding: str) 
     if (mesh.corner_colors[mesh.texture_ids >= 0] != 1).any():
         mesh, _ = with_added_albedo(mesh, np.zeros((len(mesh.faces), 3)), encoding)
     colors = decode(torch.from_numpy(mesh.corner_colors), encoding).numpy()
-    parts = []
     # A mask of the faces of the part, its texture or NO_TEXTURE, and its gloss, empty if matte.
     for is_in_part, texture_id, gloss in by_material(mesh):
         has_texture = texture_id >= 0
         # Mitsuba shows either a texture or the colors of corners, which a white one would hide.
         is_white = has_texture and mesh.textures[texture_id].min() == 255
         has_factors = has_texture and mesh.gloss_textures
-        part = Part(
+        yield Part(
             positions=mesh.vertices[mesh.faces[is_in_part]],
             normals=normals[is_in_part],
             uvs=mesh.corner_uvs[is_in_part],
@@ -201,8 +196,6 @@ def split_parts(mesh: Mesh, normals: Float[np.ndarray, "F 3 3"], encoding: str) 
             gloss=np.array(gloss) if gloss else None,
             factors=mesh.gloss_textures[texture_id] if has_factors else None,
         )
-        parts.append(part)
-    return parts
 
 
 def shape(

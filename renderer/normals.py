@@ -258,13 +258,12 @@ def normal_groups(
         has_area = lengths > 0
         unit_normals = area_vectors / np.where(has_area, lengths, 1)[:, None]
         # Pairs of corners 3 f + c at one vertex, of faces f that share an edge there.
-        first, second = _neighbors(faces)
-        cosines = np.einsum("ni,ni->n", unit_normals[first // 3], unit_normals[second // 3])
-        is_smooth = cosines >= np.cos(np.radians(min(crease + ROUNDING_ANGLE, 180)))
-        by_crease = _joined(faces, first[is_smooth], second[is_smooth])
+        pairs = _neighbors(faces)
+        is_smooth = _are_similar(unit_normals, pairs // 3, min(crease + ROUNDING_ANGLE, 180))
+        by_crease = _joined(faces, pairs[:, is_smooth])
     groups = by_crease
     if file_normals is not None:
-        by_file, is_given = _groups_of_file(faces, unit_normals, file_normals, first, second)
+        by_file, is_given = _groups_of_file(faces, unit_normals, file_normals, pairs)
         # Groups by crease have numbers behind those of the groups of the file.
         groups = np.where(is_given, by_file, by_crease + by_file.max() + 1)
     separate = np.arange(faces.size).reshape(-1, 3)
@@ -282,17 +281,13 @@ def normal_groups(
 
 
 def _groups_of_file(
-    faces: np.ndarray,
-    face_normals: np.ndarray,
-    file_normals: np.ndarray,
-    first: np.ndarray,
-    second: np.ndarray,
+    faces: np.ndarray, face_normals: np.ndarray, file_normals: np.ndarray, pairs: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Group corners by their normals in a file, and tell which corners have one, shape (F, 3) each.
 
-    `first` and `second` are the corners of neighboring faces (see `_neighbors`). Corners of faces
-    that only touch at a vertex are compared, too, in the order of their normals. Faces of opposite
-    winding, which run along a common edge in the same direction, are in different groups.
+    `pairs` are corners of neighboring faces (see `_neighbors`). Corners of faces that only touch at
+    a vertex are compared, too, in the order of their normals. Faces of opposite winding, which run
+    along a common edge in the same direction, are in different groups.
     """
     lengths = np.linalg.norm(file_normals.astype(np.float64), axis=-1)
     is_given = (lengths > 0) & np.isfinite(lengths)
@@ -308,17 +303,21 @@ def _groups_of_file(
     # neighbors is compared.
     order = np.argsort(vertex * 2**33 + rounded @ [2**22, 2**11, 1])
     is_same_vertex = vertex[order[1:]] == vertex[order[:-1]]
-    first = np.concatenate([first, order[:-1][is_same_vertex]])
-    second = np.concatenate([second, order[1:][is_same_vertex]])
-    cosines = np.einsum("ni,ni->n", unit_normals[first], unit_normals[second])
-    agree = cosines >= np.cos(np.radians(FILE_ANGLE))
+    in_order = np.stack([order[:-1], order[1:]])
+    pairs = np.concatenate([pairs, in_order[:, is_same_vertex]], axis=1)
+    agree = _are_similar(unit_normals, pairs, FILE_ANGLE)
     count = vertex.max() + 1
-    edges, counts = np.unique(
-        vertex * count + np.roll(faces, -1, axis=1).ravel(), return_counts=True
-    )
+    directed_edges = vertex * count + np.roll(faces, -1, axis=1).ravel()
+    edges, counts = np.unique(directed_edges, return_counts=True)
     is_mixed = np.isin(np.arange(count), np.divmod(edges[counts > 1], count))
-    agree &= ~is_mixed[vertex[first]] | (side[first] * side[second] > 0)
-    return _joined(faces, first[agree], second[agree]), is_given
+    agree &= ~is_mixed[vertex[pairs[0]]] | (side[pairs].prod(axis=0) > 0)
+    return _joined(faces, pairs[:, agree]), is_given
+
+
+def _are_similar(unit_normals: np.ndarray, pairs: np.ndarray, angle: float) -> np.ndarray:
+    """Tell for which pairs of indices (2, N) the normals differ by at most an angle in degrees."""
+    cosines = np.einsum("ni,ni->n", *unit_normals[pairs])
+    return cosines >= np.cos(np.radians(angle))
 
 
 def _neighbors(faces: np.ndarray) -> Int[np.ndarray, "2 N"]:
@@ -349,12 +348,12 @@ def _neighbors(faces: np.ndarray) -> Int[np.ndarray, "2 N"]:
     return np.concatenate(pairs, axis=1)
 
 
-def _joined(faces: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+def _joined(faces: np.ndarray, pairs: Int[np.ndarray, "2 N"]) -> np.ndarray:
     """Number the groups of corners that pairs of corners connect, shape (F, 3)."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
-    graph = coo_array((np.ones(len(first), np.int8), (first, second)), (faces.size, faces.size))
+    graph = coo_array((np.ones(pairs.shape[1], np.int8), tuple(pairs)), (faces.size, faces.size))
     return connected_components(graph, directed=False)[1].astype(np.int64).reshape(-1, 3)
 
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -58,52 +59,6 @@ class FittedPhotograph(NamedTuple):
 
     scene: FittedScene
     window: Window
-
-
-@dataclass(frozen=True)
-class Photograph:
-    """Photograph that an upright camera took.
-
-    Attributes:
-        pixels: RGB values, uint8, shape (H, W, 3).
-        focal_length: Focal length in pixels. None for a camera without
-            perspective.
-    """
-
-    pixels: UInt8[Array, "height width 3"]
-    focal_length: float | None
-
-    def window(self, center: Array, side: float, z_axis: Array) -> Window:
-        """Compute a square window around a point of the photograph.
-
-        The window shows what the camera would see if it were turned toward the
-        point and stayed upright. Without perspective, the window is a square of the
-        photograph itself. `center` is a column and a row, and `side` is in pixels. `z_axis`
-        has the components right, up and back of the camera that took the photograph.
-        """
-        focal_length = self.focal_length
-        if focal_length is None:
-            # Columns grow to the right as x does, but rows grow downward.
-            column, row = center
-            homography = np.array([[1.0, 0.0, column], [0.0, -1.0, row], [0.0, 0.0, 1.0]])
-            return Window(homography, side, np.eye(3))
-        height, width = self.pixels.shape[:2]
-        # Matrix from a direction (x, y, z) in the axes of the camera
-        # to the homogeneous position (column, row, 1) · (-z) in the
-        # photograph. The column is width / 2 - focal_length · x / z.
-        to_pixels = np.diag([focal_length, -focal_length, -1.0])
-        to_pixels[:2, 2] = -width / 2, -height / 2
-        # Direction in which the camera sees the point.
-        forward = np.linalg.solve(to_pixels, np.array([*center, 1.0]))
-        # Axes of the turned camera. Its axis to the right is horizontal.
-        back = -forward / np.linalg.norm(forward)
-        right = np.cross(z_axis, back)
-        right /= np.linalg.norm(right)
-        axes = np.stack([right, np.cross(back, right), back])
-        # The turned camera sees the point (x, y, 1) of the
-        # window in the direction (x, y, -focal_length).
-        to_direction = np.diag([1.0, 1.0, -focal_length])
-        return Window(to_pixels @ axes.T @ to_direction, side, axes)
 
 
 @dataclass(frozen=True)
@@ -185,6 +140,41 @@ class Window:
         return np.stack([columns / weights, rows / weights], axis=-1)
 
 
+def window_around(
+    shape: tuple[int, ...], focal_length: float | None, center: Array, side: float, z_axis: Array
+) -> Window:
+    """Compute a square window around a point of a photograph that an upright camera took.
+
+    The window shows what the camera would see if it were turned toward the
+    point and stayed upright. Without perspective (a `focal_length` of None), the window is a
+    square of the photograph itself. `center` is a column and a row, and `side` is in pixels, as
+    the focal length is. `z_axis` has the components right, up and back of the camera. `shape`
+    begins with the height and the width of the photograph.
+    """
+    if focal_length is None:
+        # Columns grow to the right as x does, but rows grow downward.
+        column, row = center
+        homography = np.array([[1.0, 0.0, column], [0.0, -1.0, row], [0.0, 0.0, 1.0]])
+        return Window(homography, side, np.eye(3))
+    height, width = shape[:2]
+    # Matrix from a direction (x, y, z) in the axes of the camera
+    # to the homogeneous position (column, row, 1) · (-z) in the
+    # photograph. The column is width / 2 - focal_length · x / z.
+    to_pixels = np.diag([focal_length, -focal_length, -1.0])
+    to_pixels[:2, 2] = -width / 2, -height / 2
+    # Direction in which the camera sees the point.
+    forward = np.linalg.solve(to_pixels, np.array([*center, 1.0]))
+    # Axes of the turned camera. Its axis to the right is horizontal.
+    back = -forward / np.linalg.norm(forward)
+    right = np.cross(z_axis, back)
+    right /= np.linalg.norm(right)
+    axes = np.stack([right, np.cross(back, right), back])
+    # The turned camera sees the point (x, y, 1) of the
+    # window in the direction (x, y, -focal_length).
+    to_direction = np.diag([1.0, 1.0, -focal_length])
+    return Window(to_pixels @ axes.T @ to_direction, side, axes)
+
+
 def fit_photograph(
     photograph: UInt8[NDArray[Any], "height width 3"],
     mask: UInt8[NDArray[Any], "height width"],
@@ -215,7 +205,7 @@ def fit_photograph(
     # Side of the window in pixels.
     side = WINDOW_SCALE * max(int(np.ptp(rows)), int(np.ptp(columns)), 1)
     focal_length = None if fov is None else side / 2 / math.tan(math.radians(fov) / 2)
-    camera_image = Photograph(photograph, focal_length)
+    window_at = partial(window_around, photograph.shape, focal_length)
 
     def fit(window: Window, start: Camera | None) -> FittedScene:
         """Fit the camera and the light in one window. Without a start camera, search for one."""
@@ -228,14 +218,14 @@ def fit_photograph(
     # The window needs the direction of the world's z-axis in the axes of the photograph's camera:
     # right, up and back. For the first fit, this direction is guessed.
     polar = math.radians(GUESSED_POLAR)
-    window = camera_image.window(center, side, np.array([0.0, math.sin(polar), math.cos(polar)]))
+    window = window_at(center, side, np.array([0.0, math.sin(polar), math.cos(polar)]))
     scene = fit(window, None)
     # The first fit gives a better direction of the z-axis for the second fit. The axes right, up
     # and back of the fitted camera are also the axes of the window.
     up = window.axes.T @ scene.camera.axes()[:, 2]
     # The camera of the photograph is upright, so the z-axis does not point to its right.
     up[0] = 0
-    upright_window = camera_image.window(center, side, up)
+    upright_window = window_at(center, side, up)
     if np.abs(upright_window.axes - window.axes).max() > MAX_AXIS_CHANGE:
         window = upright_window
         scene = fit(window, scene.camera)
@@ -244,7 +234,7 @@ def fit_photograph(
     # Offset (right, up) of the mesh center from the window center, in pixels.
     offset = np.array([camera.right, camera.up]) * window.side / camera.width
     up = window.axes.T @ camera.axes()[:, 2]
-    centered_window = camera_image.window(window.pixels(*offset), window.side, up)
+    centered_window = window_at(window.pixels(*offset), window.side, up)
     return FittedPhotograph(scene._replace(camera=_turned_to_mesh(camera)), centered_window)
 
 

@@ -371,12 +371,9 @@ def _transforms_intrinsics(entries: Mapping[str, Any]) -> tuple[np.ndarray, tupl
     ratio = tangents[1] / tangents[0] if all(tangents) else 1
     width = int(entries["w"] if has_size else errors.MAX_SCALE)
     height = int(entries["h"] if has_size else round(width * ratio))
-    focal_lengths = []
-    for axis, side in (("x", width), ("y", height)):
-        if f"fl_{axis}" in entries:
-            focal_lengths.append(float(entries[f"fl_{axis}"]))
-        elif f"camera_angle_{axis}" in entries:
-            focal_lengths.append(side / 2 / math.tan(float(entries[f"camera_angle_{axis}"]) / 2))
+    sides = zip("xy", (width, height), tangents, strict=True)
+    given = [entries.get(f"fl_{axis}", side / 2 / t if t else None) for axis, side, t in sides]
+    focal_lengths = [float(length) for length in given if length]
     if not focal_lengths:
         keys = "fl_x, fl_y, camera_angle_x or camera_angle_y"
         raise InputError(f"the cameras have no focal length: give {keys}")

@@ -145,9 +145,9 @@ def render(
     all_cameras = _checked_cameras(mesh, cameras, albedo_scale, gloss)
     light = None if light is None else _as_light(light)
     albedo = None if albedo is None else _as_albedo(albedo, mesh)
-    vertices = None if vertices is None else errors.as_tensor("vertices", vertices)
-    if vertices is not None:
-        errors.require_shape("vertices", vertices, *mesh.vertices.shape)
+    is_moved = vertices is not None
+    vertices = errors.as_tensor("vertices", vertices if is_moved else mesh.vertices)
+    errors.require_shape("vertices", vertices, *mesh.vertices.shape)
     given_lights = errors.as_list("lights", lights, LocalBasis | tuple, _LOCAL_LIGHTS)
     # Each local light becomes a pair of a basis and its coefficients.
     local_lights = [_with_coefficients(local_light) for local_light in given_lights]
@@ -166,8 +166,6 @@ def render(
     albedo = None if albedo is None else albedo.to(like.device)
     split = SplitLight(light, [(basis, values.to(like)) for basis, values in local_lights])
 
-    is_moved = vertices is not None
-    vertices = torch.from_numpy(mesh.vertices) if vertices is None else vertices
     if mesh.origin.any() and is_movable:
         vertices = vertices.double() - torch.from_numpy(mesh.origin).to(vertices.device)
         all_cameras = [camera.translated(-mesh.origin) for camera in pinholes]
@@ -183,7 +181,7 @@ def render(
         raise InputError(f"there are {len(backgrounds)} backgrounds: give 1 or {view_count}")
     # Several views at once form a tall image. Rays and silhouettes need single views.
     casts_rays = bool(local_lights) or settings.global_illumination
-    at_once = 1 if silhouettes else views_at_once(settings, vertices, casts_rays)
+    at_once = 1 if silhouettes else views_at_once(settings, like.device, casts_rays)
     is_closed = moved_mesh.closed if is_moved else mesh.closed
     fixed_cameras = [camera.fixed() for camera in all_cameras]
     shown = vertices, mesh.faces, fixed_cameras, settings, _choose(rasterizer), is_closed

@@ -137,7 +137,8 @@ def setting(
 
 def pair(default: Any, about: str, within: tuple[float, float], unit: str = "") -> Any:
     """Create a field for the smallest and the largest value of what `about` says."""
-    return setting(default, f"Smallest and largest {about}", unit, within=within, is_pair=True)
+    about = f"Smallest and largest {about}"
+    return setting(default, about, unit, within=within, length=2, is_pair=True)
 
 
 def setting_like(kind: type, name: str, default: Any) -> Any:
@@ -149,7 +150,7 @@ def _field(default: Any, facts: Facts) -> Any:
     """Create a field of a dataclass, and store facts about the field in its metadata."""
     metadata = {"facts": facts}
     if isinstance(default, list | dict):
-        return field(default_factory=partial(deepcopy, default), metadata=metadata)
+        default = partial(deepcopy, default)
     if callable(default):
         return field(default_factory=default, metadata=metadata)
     return field(default=default, metadata=metadata)
@@ -238,16 +239,11 @@ def _check_value(name: str, value: Any, facts: Facts) -> None:
         raise InputError(f"{name} is empty: give a name", name)
     if facts.is_filled and not value:
         raise InputError(f"{name} must not be empty: name one or more", name)
-    if facts.is_pair:
-        lower = -math.inf if facts.minimum is None else facts.minimum
-        upper = math.inf if facts.maximum is None else facts.maximum
-        if len(value) != 2 or not lower <= value[0] <= value[1] <= upper:
-            expected = f"give [minimum, maximum] from {lower:g} to {upper:g}"
-            raise InputError(f"{name}={list(value)}: {expected}", name)
-        return
     items = list(value) if _is_list(value) else [value]
     if facts.length not in (None, len(items)):
         raise InputError(f"{name}={items}: give {facts.length} numbers", name)
+    if facts.is_pair and items[0] > items[1]:
+        raise InputError(f"{name}={items}: give [minimum, maximum]", name)
     # Words for the error, sign, comparison and number of each limit.
     limits = facts.limits
     for item in items:

@@ -445,7 +445,7 @@ class DirectRenderer:
         if self.settings.silhouettes:
             return 1
         casts_rays = self.settings.global_illumination or bool(self.basis.local_lights)
-        return views_at_once(self.settings, self.like, casts_rays)
+        return views_at_once(self.settings, self.like.device, casts_rays)
 
     def radiance(
         self, example: int, group: Group, background: Float[Tensor, "_ pixels"], is_draft: bool

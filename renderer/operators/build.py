@@ -66,7 +66,7 @@ def build_operators(
     if not casts_rays and torch.device(device).type == "cuda":
         vertices = torch.from_numpy(vertices).to(device)
     shown = vertices, mesh.faces, cameras, settings, rasterizer, mesh.closed
-    views = build_fragments(*shown, views_at_once(settings, vertices, casts_rays))
+    views = build_fragments(*shown, views_at_once(settings, torch.device(device), casts_rays))
     transport = build_transport(mesh, settings, albedo_scale, basis)
     rays = transport.rays if transport else Rays(mesh)
     surfaces = [Surface(mesh, fragments, settings, given_gloss=gloss) for fragments in views]

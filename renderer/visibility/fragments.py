@@ -239,17 +239,18 @@ class Fragments:
 
     def distribute(
         self, values: Float[Tensor, "N D"], samples: Int[Tensor, " N"]
-    ) -> Float[Tensor, "G 3 D"]:
+    ) -> Float[Tensor, "D _"]:
         """Add up values at N of the samples for each corner of the faces that the samples show.
 
         Each value is multiplied by the barycentric weight of the corner at the
-        sample. This is the transpose of `interpolate`, as in backpropagation.
+        sample. This is the transpose of `interpolate`, as in backpropagation. The columns are all
+        first corners of the G seen faces, then all second and all third corners.
         """
         seen_face = self.sample_to_seen_face.index_select(0, samples)
         shape = (3 * values.shape[1], len(self.faces))
         corner_rows = _distribute(values.T, seen_face, self.barycentric[samples].T, shape)
-        # The axes corner, value, seen face become seen face, corner, value.
-        return corner_rows.unflatten(0, (3, -1)).permute(2, 0, 1)
+        # The axes corner, value, seen face become value, corner and seen face.
+        return corner_rows.unflatten(0, (3, -1)).transpose(0, 1).flatten(1)
 
     def merge(self, albedo: Float[Tensor, "S C"]) -> Float[Tensor, "R C"]:
         """Add up the albedo of each of the R `groups`, divided by the samples of a pixel.
@@ -376,15 +377,14 @@ def samples_on_gpu(device: torch.device) -> int:
     return int(MEMORY_FRACTION * memory / SAMPLE_BYTES)
 
 
-def views_at_once(settings: ImageSettings, vertices: np.ndarray | Tensor, casts_rays: bool) -> int:
+def views_at_once(settings: ImageSettings, device: torch.device, casts_rays: bool) -> int:
     """Return how many views are shaded at once. Few samples take as long as many.
 
     Rays need single views.
     """
     if casts_rays:
         return 1
-    is_on_gpu = isinstance(vertices, Tensor) and vertices.is_cuda
-    samples = samples_on_gpu(vertices.device) if is_on_gpu else SAMPLES_ON_CPU
+    samples = samples_on_gpu(device) if device.type == "cuda" else SAMPLES_ON_CPU
     return max(1, samples // (settings.pixel_count * settings.samples**2))
 
 

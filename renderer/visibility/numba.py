@@ -5,7 +5,7 @@ The arithmetic and the results are the same as in
 __pycache__. If this folder is read-only, numba stores it below ~/.cache.
 
 Positions are fixed-point numbers: integers in units of a subsample, which is
-1 / 2^bits of a sample. x points to the right and y down.
+1 / SUBSAMPLES of a sample. x points to the right and y down.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+import renderer.visibility.numpy as exact
 from renderer.errors import import_package
 from renderer.visibility.numpy import FAR, SUBSAMPLE_BITS, FaceIds, Faces, Views, to_fixed_point
 
@@ -25,9 +26,7 @@ VERSION = numba.__version__
 # Types of the arguments and of the result of `_draw`, for which numba compiles it: positions (2, V)
 # and depths (V,) of the vertices, faces (F, 3), and the index of the nearest face and its depth at
 # each sample.
-TYPES = (
-    "void(int64[:, ::1], float64[::1], uint64[:, ::1], b1, int64, int32[:, ::1], float32[:, ::1])"
-)
+TYPES = "void(int64[:, ::1], float64[::1], uint64[:, ::1], b1, int32[:, ::1], float32[:, ::1])"
 
 
 def rasterize(points: Views, faces: Faces, shape: tuple[int, int], closed: bool) -> FaceIds:
@@ -44,7 +43,7 @@ def rasterize(points: Views, faces: Faces, shape: tuple[int, int], closed: bool)
     for view_points, view_ids in zip(points, ids, strict=True):
         nearest_depths.fill(FAR)
         positions, depths = to_fixed_point(view_points, shape)
-        _draw(positions, depths, corners, closed, SUBSAMPLE_BITS, view_ids, nearest_depths)
+        _draw(positions, depths, corners, closed, view_ids, nearest_depths)
     return ids
 
 
@@ -62,68 +61,50 @@ def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         return _njit(TYPES)(function)
 
 
-@_njit
-def _doubled_area(x: Any, y: Any, a: int, b: int, c: int) -> Any:
-    """Compute twice the signed area of a triangle, negative if counter-clockwise in the image."""
-    return (x[b] - x[a]) * (y[c] - y[a]) - (x[c] - x[a]) * (y[b] - y[a])
+# numba compiles anew only if this file changes. After a change of these functions in the other
+# file, delete __pycache__.
+_doubled_area = _njit(exact.doubled_areas)
+_next_sample = _njit(exact.next_sample)
+_depth_plane = _njit(exact.depth_planes)
 
 
 @_njit
-def _covered_range(
-    coordinates: Any, a: int, b: int, c: int, bits: int, count: int
-) -> tuple[int, int]:
+def _covered_range(coordinates: Any, a: int, b: int, c: int, count: int) -> tuple[int, int]:
     """Find the range of rows, or of columns, in which a triangle can cover samples.
 
-    `coordinates` are y of all vertices for rows and x for columns, with `bits` fractional
-    bits. The results are the first row, and the first row after the range.
+    `coordinates` are y of all vertices for rows and x for columns. The results are the first row,
+    and the first row after the range.
     """
     least = min(coordinates[a], coordinates[b], coordinates[c])
     greatest = max(coordinates[a], coordinates[b], coordinates[c])
-    # The operator >> divides by 2^bits and rounds down. The two minus signs make it round
-    # up.
-    return max(-(-least >> bits), 0), min(-(-greatest >> bits), count)
+    return max(_next_sample(least), 0), min(_next_sample(greatest), count)
 
 
 @_njit
-def _sort_downward(ax: int, ay: int, bx: int, by: int, cx: int, cy: int) -> Any:
-    """Sort three corners by y, which points down: x and y of the top, middle and bottom corner."""
-    if ay > by:
-        ax, ay, bx, by = bx, by, ax, ay
-    if by > cy:
-        bx, by, cx, cy = cx, cy, bx, by
-    if ay > by:
-        ax, ay, bx, by = bx, by, ax, ay
-    return ax, ay, bx, by, cx, cy
-
-
-@_njit
-def _crossing(x: int, y: int, to_x: int, to_y: int, row_y: int, bits: int) -> int:
+def _crossing(x: int, y: int, to_x: int, to_y: int, row_y: int) -> int:
     """Find the first column of samples at or after the point at which a row crosses an edge.
 
-    All coordinates are in subsamples, which are 1 / 2^bits of a sample. The row crosses the edge at
-    x + (row_y - y) (to_x - x) / (to_y - y). This is divided by 2^bits and rounded up.
+    All coordinates are in subsamples. The row crosses the edge at
+    x + (row_y - y) (to_x - x) / (to_y - y). This is divided by SUBSAMPLES and rounded up.
     """
     # The operator // rounds down. The minus sign before it makes the result round up.
-    return -(((to_x - x) * (y - row_y) - x * (to_y - y)) // ((to_y - y) << bits))
+    return -(((to_x - x) * (y - row_y) - x * (to_y - y)) // ((to_y - y) << SUBSAMPLE_BITS))
 
 
 @_compiled
-def _draw(
-    positions: Any, depths: Any, faces: Any, closed: bool, bits: int, ids: Any, nearest: Any
-) -> None:
+def _draw(positions: Any, depths: Any, faces: Any, closed: bool, ids: Any, nearest: Any) -> None:
     """Draw faces in place in ascending order, so that at equal depth the lower index stays."""
     x = positions[0]
     y = positions[1]
     row_count, column_count = ids.shape
-    subsamples = 1 << bits
     for index in range(len(faces)):
         i, j, k = faces[index]
         # Skip faces without an area and, of a closed mesh, faces that are seen from behind.
-        area = _doubled_area(x, y, i, j, k)
+        area = _doubled_area(((x[i], x[j], x[k]), (y[i], y[j], y[k])))
         if area == 0 or (closed and area > 0):
             continue
-        top, bottom = _covered_range(y, i, j, k, bits, row_count)
-        left, right = _covered_range(x, i, j, k, bits, column_count)
+        top, bottom = _covered_range(y, i, j, k, row_count)
+        left, right = _covered_range(x, i, j, k, column_count)
         if top >= bottom or left >= right:
             continue
         # Sort the corners, so that two faces with the same corners in another order get
@@ -131,26 +112,26 @@ def _draw(
         a = min(i, j, k)
         c = max(i, j, k)
         b = i + j + k - a - c
-        to_b = depths[b] - depths[a]
-        to_c = depths[c] - depths[a]
-        scale = subsamples / _doubled_area(x, y, a, b, c)
-        # Change of the depth of the face from one column, or row, to the next.
-        slope_x = (to_b * (y[c] - y[a]) - to_c * (y[b] - y[a])) * scale
-        slope_y = (to_c * (x[b] - x[a]) - to_b * (x[c] - x[a])) * scale
-        # Position of the corner a in samples, which need not be a whole number.
-        first_column = x[a] / subsamples
-        first_row = y[a] / subsamples
-        ax, ay, bx, by, cx, cy = _sort_downward(x[a], y[a], x[b], y[b], x[c], y[c])
+        triangle = ((x[a], x[b], x[c]), (y[a], y[b], y[c]))
+        plane = _depth_plane(triangle, (depths[a], depths[b], depths[c]), _doubled_area(triangle))
+        # Position and depth of the corner a, and slopes of the depth, in samples.
+        first_column, first_row, depth_a, slope_x, slope_y = plane
+        # From here on, a is the top corner and c the bottom corner. y points down.
+        if y[a] > y[b]:
+            a, b = b, a
+        if y[b] > y[c]:
+            b, c = c, b
+        if y[a] > y[b]:
+            a, b = b, a
+        ax, ay, bx, by, cx, cy = x[a], y[a], x[b], y[b], x[c], y[c]
         for row in range(top, bottom):
-            row_y = row << bits
-            row_depth = depths[a] + (row - first_row) * slope_y
+            row_y = row << SUBSAMPLE_BITS
+            row_depth = depth_a + (row - first_row) * slope_y
             # A row crosses the edge from the top to the bottom corner, and one of the
             # two other edges.
-            long_edge = _crossing(ax, ay, cx, cy, row_y, bits)
+            long_edge = _crossing(ax, ay, cx, cy, row_y)
             short_edge = (
-                _crossing(ax, ay, bx, by, row_y, bits)
-                if row_y < by
-                else _crossing(bx, by, cx, cy, row_y, bits)
+                _crossing(ax, ay, bx, by, row_y) if row_y < by else _crossing(bx, by, cx, cy, row_y)
             )
             first = max(min(long_edge, short_edge), 0)
             end = min(max(long_edge, short_edge), column_count)

@@ -160,15 +160,9 @@ def to_fixed_point(
     # float64 array is float64, so that only the conversion to float32 below rounds.
     window = points[:, :2].T.astype(np.float32, order="C") * np.array([[half_width], [-half_width]])
     window += [[half_width], [half_height]]
-    snapped = window.astype(np.float32)
-    snapped *= SUBSAMPLES
-    positions = np.rint(snapped, out=snapped).astype(np.int64)
+    positions = np.rint(window.astype(np.float32) * SUBSAMPLES).astype(np.int64)
     # Measure from the center of the first sample instead of its corner.
-    positions -= SUBSAMPLES // 2
-    depths = points[:, 2] + 1
-    depths /= 2
-    depths *= FAR
-    return positions, depths
+    return positions - SUBSAMPLES // 2, (points[:, 2] + 1) / 2 * FAR
 
 
 def doubled_areas(triangles: Any) -> Any:

@@ -31,7 +31,7 @@ proportional to the depth, and 1 without perspective.
 from __future__ import annotations
 
 import math
-from dataclasses import InitVar, dataclass
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -111,8 +111,11 @@ def moving_outlines(
     indices = torch.arange(len(fragments.sample_numbers), dtype=torch.int32, device=vertices.device)
     # Index of each sample of the image among the covered samples, or NOT_COVERED.
     sample_grid = fragments.image_of_samples(indices, NOT_COVERED)
-    places = positions.detach(), nearness.detach()
-    crossings = _Silhouettes(fragments, *places, faces, sample_grid).crossings()
+    points = torch.cat([positions[:, :2] / positions[:, 2:], nearness[:, None]], dim=1).detach()
+    silhouettes = _Silhouettes(fragments, points, faces, sample_grid)
+    # Those in rows come first.
+    both = zip(silhouettes.crossings_along(X), silhouettes.crossings_along(Y), strict=True)
+    crossings = Crossings(*(torch.cat(pair, dim=-1) for pair in both))
     # Pixels that show no mesh, but have a sample beside a visible silhouette.
     crossed_pixels = _pixels_of_cells(crossings.cells, fragments).unique()
     uncovered_pixels = crossed_pixels[~torch.isin(crossed_pixels, fragments.pixels)]
@@ -187,24 +190,21 @@ class _MovingView:
         # Radiance times upstream gradient, summed over the color channels.
         weighted_radiance = (self.radiance * upstream_at_samples).sum(0)
         weighted_image = fragments.image_of_samples(weighted_radiance, torch.nan)
-        gradient_right = self._gradient_along(X, weighted_image, upstream_at_samples)
-        gradient_down = self._gradient_along(Y, weighted_image, upstream_at_samples)
+        right, down = (
+            self._gradient_along(axis, weighted_image, upstream_at_samples) for axis in (X, Y)
+        )
         # Most samples have neighbors of the same color. Their gradient is 0.
-        has_gradient = (gradient_right != 0) | (gradient_down != 0)
-        samples = torch.nonzero(has_gradient).squeeze(1)
+        samples = torch.nonzero((right != 0) | (down != 0)).squeeze(1)
         # Gradient with respect to the image position (x, y) of each selected sample. The
         # minus sign is there because y points up.
-        sample_gradients = torch.stack(
-            [gradient_right.index_select(0, samples), -gradient_down.index_select(0, samples)]
-        ).T
+        sample_gradients = torch.stack([right, -down]).index_select(1, samples).T
         if fragments.depths is not None:
             depth = fragments.interpolate(positions[:, 2:][fragments.corners])[samples]
             places = fragments.positions()[samples]
             sample_gradients = _to_homogeneous(sample_gradients, places, depth)
         # Distribute the gradients to the corners of faces: one row for each coordinate, one
         # column for each corner.
-        corner_gradients = fragments.distribute(sample_gradients, samples)
-        corner_gradients = corner_gradients.permute(2, 1, 0).flatten(1).double()
+        corner_gradients = fragments.distribute(sample_gradients, samples).double()
         gradient = positions.new_zeros(positions.shape[::-1])
         # Without perspective, only the first two coordinates have a gradient.
         coordinate_count = sample_gradients.shape[1]
@@ -226,7 +226,8 @@ class _MovingView:
         grid = self.sample_grid
         # `gradient_of_silhouettes` computes the gradient where a silhouette passes between samples.
         is_along_axis = self.crossings.horizontal if axis == X else ~self.crossings.horizontal
-        crossed = list(_divmod(self.crossings.cells[0, is_along_axis], grid.shape[1]))
+        cells = self.crossings.cells[0, is_along_axis]
+        crossed = [cells // grid.shape[1], cells % grid.shape[1]]
         if axis == Y:
             # Make rows of the image of its columns.
             weighted_image, grid = weighted_image.T, grid.T
@@ -287,14 +288,11 @@ class _MovingView:
         crossing_gradients = (toward_second * along * crossings.normal).T
         # Distances by which a crossing moves if the first, or the second, end of its edge
         # moves by 1.
-        end_weights = (1 - crossings.fraction, crossings.fraction)
-        gradients = []
-        for end_vertices, end_weight in zip(crossings.ends, end_weights, strict=True):
-            x, y, depth = positions[end_vertices].T
-            end_position = torch.stack([x / depth, y / depth], dim=1)
-            end_gradients = crossing_gradients * end_weight[:, None]
-            gradients.append(_to_homogeneous(end_gradients, end_position, depth[:, None]))
-        return crossings.ends.flatten(), torch.cat(gradients)
+        end_weights = torch.stack([1 - crossings.fraction, crossings.fraction])
+        end_gradients = (crossing_gradients * end_weights[..., None]).flatten(0, 1)
+        ends = crossings.ends.flatten()
+        places, depth = positions[ends].split([2, 1], dim=1)
+        return ends, _to_homogeneous(end_gradients, places / depth, depth)
 
 
 def _to_homogeneous(
@@ -309,20 +307,14 @@ def _to_homogeneous(
     return torch.cat([gradients, depth_gradient], dim=1) / depth
 
 
-def _divmod(numbers: Tensor, divisor: int) -> tuple[Tensor, Tensor]:
-    """Divide whole numbers into quotients and remainders."""
-    return numbers // divisor, numbers % divisor
-
-
 def _pixels_of_cells(cells: Tensor, fragments: Fragments) -> Tensor:
     """Find the row-major pixels to which samples, row-major in the whole image, belong."""
     samples = fragments.samples
     width = fragments.shape[1]
-    row, column = _divmod(cells, width * samples)
-    return row // samples * width + column // samples
+    pixel_row = cells // (width * samples**2)
+    return pixel_row * width + cells % (width * samples) // samples
 
 
-@dataclass(eq=False, repr=False)
 class _Silhouettes:
     """Silhouette edges of a view, which may be hidden.
 
@@ -332,23 +324,18 @@ class _Silhouettes:
     normal in the image.
     """
 
-    fragments: Fragments
-    positions: InitVar[Float[Tensor, "V 3"]]
-    nearness: Float[Tensor, " V"]
-    faces: InitVar[Int[np.ndarray, "F 3"]]
-    sample_grid: Int[Tensor, "_ _"]
-
-    def __post_init__(self, positions: Tensor, faces: np.ndarray) -> None:
-        """Find the silhouette edges, from homogeneous positions."""
-        nearness = self.nearness
-        x, y, w = positions.T
-        points = torch.stack([x / w, y / w, nearness], dim=1)
+    def __init__(
+        self, fragments: Fragments, points: Tensor, faces: np.ndarray, sample_grid: Tensor
+    ) -> None:
+        """Find the silhouette edges. Points have an image position and a nearness, (V, 3)."""
+        self.fragments, self.sample_grid = fragments, sample_grid
+        self.nearness = nearness = points[:, 2]
         # Positions are rounded to subsamples as in rasterizers.
-        rows, columns = self.sample_grid.shape
+        rows, columns = sample_grid.shape
         self.places = to_fixed_point(points, (rows, columns))[0].T.double() / SUBSAMPLES
         key = np.ascontiguousarray(faces, dtype=np.int64).tobytes()
-        all_ends, edge_of_side, direction, face_count = _edges(key, positions.device)
-        corners = torch.from_numpy(faces).to(positions.device).T
+        all_ends, edge_of_side, direction, face_count = _edges(key, points.device)
+        corners = torch.from_numpy(faces).to(points.device).T
         orientation = doubled_areas(self.places[:, corners]).sign()
         # One number for each face and each of its three edges: 1 if the face lies on one side of
         # the edge, and -1 if it lies on the other side. An edge leads to its higher vertex index.
@@ -359,20 +346,15 @@ class _Silhouettes:
         self.ends = all_ends[:, side_sums.abs() > face_count - 2]
         # Vertices that no face uses do not count.
         self.nearness_range = nearness[all_ends].max() - nearness[all_ends].min()
-        if len(self.fragments.sample_to_seen_face) == 0:
+        if len(fragments.sample_to_seen_face) == 0:
             self.ends = self.ends[:, :0]  # If no sample shows the mesh, no silhouette is visible.
         # An edge (a, b) with y down has the normal (b, a) with y up.
         normal = self.places[:, self.ends].diff(dim=1)[:, 0].flip(0)
         # Edges without length divide by a small number instead of 0.
         self.normal = normal / normal.square().sum(0).sqrt().clamp(min=1 / SUBSAMPLES)
 
-    def crossings(self) -> Crossings:
-        """Find where visible silhouettes pass between neighboring samples, in rows first."""
-        both = zip(self.crossings_along(X), self.crossings_along(Y), strict=True)
-        return Crossings(*(torch.cat(pair, dim=-1) for pair in both))
-
     def crossings_along(self, axis: int) -> Crossings:
-        """Find the crossings between neighbors in a row (`axis` is X) or column."""
+        """Find visible silhouettes between neighbors in a row (`axis` is X) or in a column."""
         rows, columns = self.sample_grid.shape
         start = self.places[:, self.ends[0]]
         end = self.places[:, self.ends[1]]
