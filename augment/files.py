@@ -9,7 +9,6 @@ import argparse
 import importlib
 import io
 import json
-import math
 import pickle
 import re
 import sys
@@ -39,7 +38,7 @@ from renderer.settings import MAX_SIZE, Size, as_size, height_and_width
 
 # A network from images (N, 3, height, width) to logits, and the sizes of the four dimensions of its
 # images. None stands for any size, or an unknown one.
-Content = tuple[Callable[[Tensor], Tensor], Sequence[int | None]]
+Content = tuple[nn.Module, Sequence[int | None]]
 
 # Weights of a network by their names.
 State = Mapping[str, Tensor]
@@ -76,15 +75,16 @@ _PERMITTED += [(_SCALAR, f"numpy.{core}.multiarray.scalar") for core in ("core",
 _PREFIXES = ("module.", "_orig_mod.", "model.", "network.", "net.")
 
 
-@dataclass(frozen=True)
+@dataclass
 class NetworkFacts:
     """Classes, image size and normalization that the user gives for a network.
 
     None leaves the choice to the source of the network, such as torchvision.
 
     Attributes:
-        classes: Names of the classes in the order of the outputs. If neither
-            the user nor the source gives names, they are "0", "1" and so on.
+        classes: Names of the classes in the order of the outputs, or a text file with a name in
+            each line, which is read. If neither the user nor the source gives names, they are "0",
+            "1" and so on.
         size: Pixels per side of the images, or height and width.
         normalization: "imagenet", or mean and standard deviation of the
             channels red, green and blue, in units of [0, 1].
@@ -92,37 +92,27 @@ class NetworkFacts:
         task: What the outputs mean, for a file that contains a network.
     """
 
-    classes: tuple[str, ...] | None = None
+    classes: Any = None
     size: Size | None = None
     normalization: classifiers.Normalization = None
     prompt: str | None = None
     task: Task | None = None
 
-
-def as_facts(
-    classes: Sequence[str] | str | Path | None = None,
-    size: Size | None = None,
-    normalization: classifiers.Normalization = None,
-    prompt: str | None = None,
-    task: Task | None = None,
-) -> NetworkFacts:
-    """Check what the user gives about a network.
-
-    Classes may be a text file with a name in each line.
-    """
-    if isinstance(classes, str | Path):
-        require_file(classes, "give a text file with the name of a class in each line")
-        with reading(Path(classes), "is no text in UTF-8", "save it as UTF-8"):
-            lines = Path(classes).read_text(encoding="utf-8-sig").splitlines()
-        classes = [line.strip() for line in lines if line.strip()]
-    names = None if classes is None else classifiers.as_class_names("classes", classes)
-    if size is not None:
-        size = as_size("size", size, MAX_SIZE)
-    if normalization is not None:
-        classifiers.mean_and_std(normalization)
-    require_kind("prompt", prompt, str | None, "a text with {} for the name of a class")
-    require_kind("task", task, Task | None, "a task, such as nb.Detection(decode=function)")
-    return NetworkFacts(names, size, normalization, prompt, task)
+    def __post_init__(self) -> None:
+        """Check the facts, and read the file of the classes."""
+        if isinstance(self.classes, str | Path):
+            require_file(self.classes, "give a text file with the name of a class in each line")
+            with reading(Path(self.classes), "is no text in UTF-8", "save it as UTF-8"):
+                lines = Path(self.classes).read_text(encoding="utf-8-sig").splitlines()
+            self.classes = [line.strip() for line in lines if line.strip()]
+        if self.classes is not None:
+            self.classes = classifiers.as_class_names("classes", self.classes)
+        if self.size is not None:
+            self.size = as_size("size", self.size, MAX_SIZE)
+        classifiers.mean_and_std(self.normalization)
+        require_kind("prompt", self.prompt, str | None, "a text with {} for the name of a class")
+        expected = "a task, such as nb.Detection(decode=function)"
+        require_kind("task", self.task, Task | None, expected)
 
 
 def require_no_facts(name: str, facts: NetworkFacts) -> None:
@@ -139,10 +129,8 @@ def is_network_file(name: str) -> bool:
     The suffix decides. Only for .pt and similar suffixes, which files of weights
     have, too, the file must also exist and be TorchScript.
     """
-    path = Path(name)
-    if path.suffix.lower() in TORCHSCRIPT:
-        return path.is_file() and is_torchscript(path)
-    return path.suffix.lower() in SUFFIXES
+    suffix = Path(name).suffix.lower()
+    return suffix in (EXPORTED, ONNX) or (suffix in TORCHSCRIPT and is_torchscript(Path(name)))
 
 
 def name_from_anywhere(name: str) -> str:
@@ -196,10 +184,9 @@ def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> TaskNetwork:
     if batch_size is not None:
         # The file takes batches of one size only. `InBatches` splits other numbers of images.
         network = InBatches(network, batch_size, batch_size)
-    if isinstance(network, nn.Module):
-        # Set the mode without a call of `eval`, which networks of torch.export refuse.
-        for module in network.modules():
-            module.training = False
+    # Set the mode without a call of `eval`, which networks of torch.export refuse.
+    for module in network.modules():
+        module.training = False
     # Images are square if the file fixes one side only. None if it fixes no side.
     size_in_file = (height, width) if height and width else height or width
     given = facts.size or size_in_file, facts.classes, facts.normalization
@@ -213,10 +200,8 @@ def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> TaskNetwork:
 def _require_evaluation_outputs(classifier: Classifier, name: str) -> None:
     """Raise InputError if logits are random or depend on other images (exported training mode)."""
     shape = (3, 3, *height_and_width(classifier.size))
-    # Three images of gray levels in random order, the same in each call.
-    levels = torch.linspace(0, 1, math.prod(shape))
-    images = levels[torch.randperm(len(levels), generator=torch.Generator().manual_seed(0))]
-    images = images.view(shape)
+    # Three random images, the same in each call.
+    images = torch.rand(shape, generator=torch.Generator().manual_seed(0))
     # Show the first image beside the second and then beside the third. Its logits must not change.
     with torch.no_grad():
         outputs = [classifier.network(images[[0, other]]) for other in (1, 2)]

@@ -409,17 +409,20 @@ def load_classifier(
     """
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     path = None if weights is None else as_path("weights", weights)
-    facts = files.as_facts(classes, size, normalization, prompt, task)
+    facts = NetworkFacts(classes, size, normalization, prompt, task)
     require_flag("trust_code", trust_code)
     classifier = load_source(name, path, facts, trust_code)
     wrappers.say_inputs(classifier.name, classifier.network, classifier.size, classifier.inputs)
     return classifier.normalizing_light(normalize_light)
 
 
-def load_source(name: str, path: Path | None, facts: NetworkFacts, trust_code: bool) -> Any:
+def load_source(
+    name: str, path: Path | None, facts: NetworkFacts, trust_code: bool, is_random: bool = False
+) -> Any:
     """Load a network by name, without the normalization of light, and without any message.
 
-    `path` is a file of weights. None stands for the weights of the source.
+    `path` is a file of weights. None stands for the weights of the source. Random weights replace
+    them with `is_random`, but not those of a file with a network and of a Python function.
     """
     # A name is "source:model", or the name of a source or a file without a colon.
     source, colon, model = name.partition(":")
@@ -432,23 +435,11 @@ def load_source(name: str, path: Path | None, facts: NetworkFacts, trust_code: b
         if path is not None:
             reason = f"cannot be combined with {name}, a file that contains weights"
             raise files.weights_error(path, f"{reason}: leave weights out")
-    elif source + colon not in ("torchvision:", "timm:", "hf:"):
+    elif not is_random and source + colon not in ("torchvision:", "timm:", "hf:"):
         files.require_no_facts(name, facts)
     elif source != "hf":
         files.require_no_facts(name, NetworkFacts(prompt=facts.prompt, task=facts.task))
     with progress.progress_message(f"loading {name}"):
         if known is None:
             return files.load_file(name, facts, trust_code)
-        return known(*([model] if colon else []), path, facts, False)
-
-
-def build_classifier(name: str, facts: NetworkFacts, trust_code: bool = False) -> Any:
-    """Build a classifier with random weights.
-
-    A Python function of the user chooses weights and size itself, and a file contains its weights.
-    These classifiers are loaded as they are.
-    """
-    source, colon, model = name.partition(":")
-    if source + colon not in SOURCES:
-        return files.load_file(name, facts, trust_code)
-    return SOURCES[source + colon](*([model] if colon else []), None, facts, True)
+        return known(*([model] if colon else []), path, facts, is_random)

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from augment.classifier import UNIT_RANGE, Classifier, Normalization, TaskNetwork, as_network
-from augment.files import as_facts, require_no_facts
+from augment.files import NetworkFacts, require_no_facts
 from augment.network import device_of, gradient_flags_kept, say_once
 from augment.settings import NormalizeLight
 from augment.tasks.detection import Detection
@@ -40,7 +40,7 @@ def run(settings: EvaluateSettings) -> None:
         # The file of a training run has its classes, size and normalization. These settings
         # are therefore an error here.
         facts = settings.classes, settings.size, settings.normalization, settings.prompt
-        require_no_facts(f"run={settings.run}", as_facts(*facts))
+        require_no_facts(f"run={settings.run}", NetworkFacts(*facts))
         if settings.decode is not None:
             raise settings.wrong("decode", "is for a file, and not for a run: leave it out")
         loaded = load_run(settings.run, settings.weights, settings.network, settings.trust)
