@@ -256,8 +256,7 @@ def _renders(
             depth = None if maps_of is None else maps_of[row, 0]
             normals = None if maps_of is None else maps_of[row, 1:]
             seen = labels, boxes, masks, visible, depth, normals
-            shown = scene.examples[example]
-            name = scene.objects[shown.object].name
+            name = scene.objects[scene.examples[example].object].name
             yield LabeledRender(start + example, images[row], *seen, facts, lights[row], name)
 
 

@@ -270,9 +270,8 @@ class DetectionCriterion(ObjectCriterion):
     def cost(self, outputs: list[Detections]) -> Float[Tensor, " N"]:
         """Return the smooth maximum of the true class, minus that of the others to mislabel."""
         columns = torch.arange(self.class_count, device=self.source.device)
-        targets = self.source if self.target is None else self.target
         costs = []
-        rows = zip(outputs, self.boxes, self.source, targets, strict=True)
+        rows = zip(outputs, self.boxes, self.source, self.targets, strict=True)
         for item, box, source, target in rows:
             # Without candidates, the final boxes stand for them.
             boxes = item.get(CANDIDATE_BOXES, item["boxes"])
@@ -290,9 +289,8 @@ class DetectionCriterion(ObjectCriterion):
             # The smooth maximum log Σ exp gives all boxes near the object a gradient.
             cost = odds[:, source].logsumexp(0)
             if self.task.goal == MISLABEL:
-                has_target = self.target is not None and target != NO_CLASS
-                others = columns[columns == target] if has_target else columns[columns != source]
-                cost = cost - odds[:, others].flatten().logsumexp(0)
+                is_other = columns != source if target == NO_CLASS else columns == target
+                cost = cost - odds[:, is_other].flatten().logsumexp(0)
             costs.append(cost)
         return torch.stack(costs)
 

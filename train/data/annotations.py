@@ -294,15 +294,13 @@ def _find_images(file: Path, names: Sequence[str]) -> dict[str, Path]:
     uses = Counter(PurePosixPath(name).name for name in names)
     for name in [name for name in names if name not in paths]:
         parts = PurePosixPath(name).parts
-        # Images of this name, by the number of equal parts at the end of their paths.
-        by_equal_parts: dict[int, list[Path]] = defaultdict(list)
-        for image in others[parts[-1]]:
-            by_equal_parts[_equal_ends(image.parts, parts)].append(image)
-        most = max(by_equal_parts, default=0)
+        # Number of equal parts at the end of the path of each image of this name.
+        equal_parts = {image: _equal_ends(image.parts, parts) for image in others[parts[-1]]}
+        most = max(equal_parts.values(), default=0)
         # An image in another folder may be any of several that have its name.
         if most == 1 and uses[parts[-1]] > 1:
             continue
-        found = by_equal_parts[most]
+        found = [image for image in equal_parts if equal_parts[image] == most]
         if len(found) > 1:
             listed = " and ".join(map(str, found[:2]))
             raise InputError(f"{file} names the image {name}, which may be {listed}")
