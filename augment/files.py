@@ -102,9 +102,7 @@ class NetworkFacts:
         """Check the facts, and read the file of the classes."""
         if isinstance(self.classes, str | Path):
             require_file(self.classes, "give a text file with the name of a class in each line")
-            with reading(Path(self.classes), "is no text in UTF-8", "save it as UTF-8"):
-                lines = Path(self.classes).read_text(encoding="utf-8-sig").splitlines()
-            self.classes = [line.strip() for line in lines if line.strip()]
+            self.classes = [*filter(None, read_lines(Path(self.classes)))]
         if self.classes is not None:
             self.classes = classifiers.as_class_names("classes", self.classes)
         if self.size is not None:
@@ -113,6 +111,12 @@ class NetworkFacts:
         require_kind("prompt", self.prompt, str | None, "a text with {} for the name of a class")
         expected = "a task, such as nb.Detection(decode=function)"
         require_kind("task", self.task, Task | None, expected)
+
+
+def read_lines(path: Path) -> list[str]:
+    """Read the lines of a text file, without spaces at their ends. Some may be empty."""
+    with explained(f"{path} is no text in UTF-8", "save it as UTF-8"):
+        return [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
 
 
 def require_no_facts(name: str, facts: NetworkFacts) -> None:

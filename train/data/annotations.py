@@ -19,6 +19,7 @@ import yaml
 from jaxtyping import Bool, Float, Int, UInt8
 from PIL import ExifTags, Image
 
+from augment.files import read_lines
 from augment.settings import NO_CLASS_PIXEL
 from renderer.errors import InputError, explained
 from renderer.io.images import SUFFIXES, gray_factor, is_hidden, open_image, read_rgb
@@ -407,19 +408,12 @@ def _validation_images(file: Path, content: Mapping[str, Any]) -> list[Path]:
         if path is None:
             console.warning("%s: its entry val names %s, which does not exist", file, place)
         elif path.is_file():
-            found += [path.parent / line for line in _lines(path)]
+            found += [path.parent / line for line in filter(None, read_lines(path))]
         else:
             found += [path / item.path for item in find_unlabeled(path)]
     if given and not any(map(Path.is_file, found)):
         raise InputError(f"{file} has no image of its entry val: {given}", "photos")
     return [*dict.fromkeys(found)]
-
-
-def _lines(file: Path) -> list[str]:
-    """Read the lines of a text file that are not empty."""
-    with explained(f"{file} is no text in UTF-8", "save it as UTF-8"):
-        lines = file.read_text(encoding="utf-8-sig").splitlines()
-    return [line.strip() for line in lines if line.strip()]
 
 
 def _yolo_classes(folder: Path, given: Path | None) -> tuple[tuple[str, ...], Path]:
@@ -444,16 +438,14 @@ def _yolo_classes(folder: Path, given: Path | None) -> tuple[tuple[str, ...], Pa
                 return tuple(known.get(i, str(i)) for i in range(max(known) + 1)), file
         for name in (*CLASS_FILES, *(f"labels/{name}" for name in CLASS_FILES)):
             if (parent / name).is_file():
-                return tuple(_lines(parent / name)), parent / name
+                return tuple(filter(None, read_lines(parent / name))), parent / name
     raise InputError(f"photos={folder} names no classes: add data.yaml or classes.txt", "photos")
 
 
 def _yolo_rows(file: Path, class_count: int, has_keypoints: bool) -> Iterator[Sequence[float]]:
     """Yield the row of each line of a label file, as `_annotated` takes it."""
-    with explained(f"{file} is no text", "write it again"):
-        lines = file.read_text(encoding="utf-8-sig").splitlines()
-    for number, line in enumerate(lines, 1):
-        if not line.strip():
+    for number, line in enumerate(read_lines(file), 1):
+        if not line:
             continue
         with explained(f"line {number} of {file} is no box", "write class x y width height"):
             label, *values = map(float, line.split()[: 5 if has_keypoints else None])

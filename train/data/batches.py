@@ -64,12 +64,11 @@ def rounds_of_epoch(
     size = round_size(image_count, *limits)
     # The sizes of the parts differ by at most one.
     parts = shown_images.tensor_split(math.ceil(len(shown_images) / size))
-    rounds = []
-    for index, part in enumerate(parts):
-        # Numbers of the images and renders of a round, in ascending order.
-        rows = torch.cat([part.sort().values, render_numbers])
-        rounds.append(Round(epoch * len(parts) + index, epoch, rows))
-    return rounds
+    # Numbers of the images and renders of a round are in ascending order.
+    return [
+        Round(epoch * len(parts) + index, epoch, torch.cat([part.sort().values, render_numbers]))
+        for index, part in enumerate(parts)
+    ]
 
 
 def training_batches(
