@@ -17,7 +17,7 @@ from PIL import Image
 from torch import Tensor, nn
 
 from augment.classifier import IMAGENET, USUAL_SIZE, TaskNetwork, as_network, mean_and_std
-from augment.files import NetworkFacts, import_package, name_error, reading_network, weights_error
+from augment.files import NetworkFacts, import_package, name_error, reading_network
 from augment.network import FILE, YOU, ChannelNormalization, Inputs, Network
 from renderer.errors import InputError
 from renderer.settings import Size, height_and_width
@@ -57,12 +57,9 @@ class ZeroShot(nn.Module):
         return self.text(F.normalize(getattr(features, "pooler_output", features), dim=-1))
 
 
-def load(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool) -> TaskNetwork:
+def load(model: str, _: Path | None, facts: NetworkFacts, is_random: bool) -> TaskNetwork:
     """Load or build a network of transformers: a folder, or a repository of the Hub."""
     name = f"hf:{model}"
-    if weights is not None:
-        reason = f"cannot be combined with {name}, which has weights: leave weights out"
-        raise weights_error(weights, reason)
     library = import_package("transformers", name, '"parametric-norm-balls[hf]"')
     advice = "give a folder that save_pretrained wrote, or a repository of the Hugging Face Hub"
     with reading_network(name, "cannot be read", advice):

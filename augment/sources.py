@@ -319,11 +319,8 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
     return network, size, classes
 
 
-def _python(name: str, weights: Path | None, *_: object) -> Any:
+def _python(name: str, *_: object) -> Any:
     """Load a classifier by a Python function that the user wrote, which chooses its weights."""
-    if weights is not None:
-        reason = f"cannot be combined with python:{name}, a function that loads the weights itself"
-        raise files.weights_error(weights, f"{reason}: leave weights out")
     network, size, classes = call_python(name)
     if isinstance(network, nn.Module):
         wrappers.keep_text_vectors(network.eval(), len(classes))
@@ -432,13 +429,13 @@ def load_source(
             choices = [f"{choice}NAME" if choice.endswith(":") else choice for choice in SOURCES]
             choices.append(f"a file ({', '.join(files.SUFFIXES)})")
             raise files.name_error(name, f"is not known: choose one of {', '.join(choices)}")
-        if path is not None:
-            reason = f"cannot be combined with {name}, a file that contains weights"
-            raise files.weights_error(path, f"{reason}: leave weights out")
     elif not is_random and source + colon not in ("torchvision:", "timm:", "hf:"):
         files.require_no_facts(name, facts)
     elif source != "hf":
         files.require_no_facts(name, NetworkFacts(prompt=facts.prompt, task=facts.task))
+    if path is not None and (known is None or source in ("hf", "python")):
+        reason = f"cannot be combined with {name}, which has its own weights: leave weights out"
+        raise files.weights_error(path, reason)
     with progress.progress_message(f"loading {name}"):
         if known is None:
             return files.load_file(name, facts, trust_code)
