@@ -31,7 +31,7 @@ from torch.utils._pytree import tree_leaves, tree_map
 from augment import classifier as classifiers
 from augment import network as wrappers
 from augment.classifier import Classifier, TaskNetwork
-from augment.network import FILE, YOU, Network, say_once, unwrapped
+from augment.network import FILE, YOU, Inputs, Network, say_once, unwrapped
 from augment.tasks.task import Task
 from renderer.errors import InputError, explained, reading, require_file, require_kind, single_line
 from renderer.settings import MAX_SIZE, Size, as_size, height_and_width
@@ -111,6 +111,11 @@ class NetworkFacts:
         require_kind("prompt", self.prompt, str | None, "a text with {} for the name of a class")
         expected = "a task, such as nb.Detection(decode=function)"
         require_kind("task", self.task, Task | None, expected)
+
+    def inputs(self, size: str | None, normalization: str | None) -> Inputs:
+        """Return who states the facts about the images of a network, besides the user."""
+        normalization = normalization if self.normalization is None else YOU
+        return Inputs(YOU if self.size else size, normalization, normalization)
 
 
 def read_lines(path: Path) -> list[str]:

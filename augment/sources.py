@@ -22,7 +22,7 @@ from augment import files, huggingface, progress
 from augment import network as wrappers
 from augment.classifier import Classifier, Normalization, as_network, mean_and_std
 from augment.files import NetworkFacts, State
-from augment.network import FILE, YOU, ChannelNormalization, Inputs, Network, unwrapped
+from augment.network import FILE, ChannelNormalization, Network, unwrapped
 from augment.settings import PYTHON, NormalizeLight, split_function
 from augment.tasks.classification import nearest
 from augment.tasks.task import Task
@@ -65,14 +65,8 @@ def _classifier(
         mean, std = mean_and_std(facts.normalization)
     normalized = Network(network, [ChannelNormalization(mean, std, bgr)])
     classifier = Classifier(normalized, facts.size or size, facts.classes or classes, name)
-    classifier.inputs = _inputs_of(facts, library, library)
+    classifier.inputs = facts.inputs(library, library)
     return classifier
-
-
-def _inputs_of(facts: NetworkFacts, size: str | None, normalization: str | None) -> Inputs:
-    """Return who states the facts about the images of a network, besides the user."""
-    normalization = normalization if facts.normalization is None else YOU
-    return Inputs(YOU if facts.size else size, normalization, normalization)
 
 
 def _torchvision(
@@ -167,7 +161,7 @@ def _with_weights(
     if all_facts != facts:
         classifier = build(all_facts)
     if not is_published:
-        classifier.inputs = _inputs_of(facts, FILE if all_facts.size else None, None)
+        classifier.inputs = facts.inputs(FILE if all_facts.size else None, None)
     return files.fill(classifier, state, source)
 
 
