@@ -373,12 +373,11 @@ def _labels_without_image(photographs: Sequence[Annotated], labels: Sequence[Pat
 
 def _label_files(path: Path) -> list[Path]:
     """Return the paths at which the label file of an image may be."""
-    parts = [*path.absolute().parts]
     beside = path.with_suffix(".txt")
     files = [beside, path.parent / "labels" / beside.name]
-    if "images" in parts:
-        place = len(parts) - 1 - parts[::-1].index("images")
-        files.insert(0, Path(*parts[:place], "labels", *parts[place + 1 :]).with_suffix(".txt"))
+    above, images, below = beside.absolute().as_posix().rpartition("/images/")
+    if images:
+        files.insert(0, Path(f"{above}/labels/{below}"))
     # Accents in names may have another form of Unicode, since archives of a Mac change them.
     forms = [file.with_name(normalize(form, file.name)) for file in files for form in FORMS]
     return [*files, *forms]
