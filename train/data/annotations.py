@@ -46,17 +46,9 @@ CLASS_FILES = ("classes.txt", "obj.names")
 ROUNDING = 1e-3
 # Number of photographs that a network sees at a time.
 BATCH = 16
-# From the coordinates (x, y) in a stored image, as fractions of its sides, to those in the upright
-# one, by the EXIF orientation. Only these exchange width and height.
-TURNED = {
-    2: lambda x, y: (1 - x, y),
-    3: lambda x, y: (1 - x, 1 - y),
-    4: lambda x, y: (x, 1 - y),
-    5: lambda x, y: (y, x),
-    6: lambda x, y: (1 - y, x),
-    7: lambda x, y: (1 - y, 1 - x),
-    8: lambda x, y: (y, 1 - x),
-}
+# EXIF orientations in which the upright image is flipped left to right, and top to bottom. Before
+# that, 5 to 8 exchange x and y.
+FLIPPED = (2, 3, 6, 7), (3, 4, 7, 8)
 
 
 @dataclass(frozen=True)
@@ -505,8 +497,9 @@ def _upright_boxes(photograph: Annotated, upright: Float[np.ndarray, "2"]) -> np
         if not is_upright and not (orientation > 4 and _is_similar(marked[::-1], upright)):
             fault = f"{photograph.path} has {upright[0]:g} × {upright[1]:g} pixels"
             raise InputError(f"{fault}, but its boxes are for {marked[0]:g} × {marked[1]:g}")
-        turn = TURNED.get(orientation, lambda x, y: (x, y))
-        corners = np.stack(turn(corners[..., 0], corners[..., 1]), axis=-1)
+        corners = corners[..., ::-1] if orientation in range(5, 9) else corners
+        is_flipped = [orientation in flipped for flipped in FLIPPED]
+        corners = np.where(is_flipped, 1 - corners, corners)
     # A turn exchanges corners, so the sides are the smaller and larger coordinates.
     corners = np.concatenate([corners.min(1), corners.max(1)], axis=-1)
     return corners * np.tile(upright, 2)
