@@ -299,25 +299,22 @@ class DetectionCriterion(ObjectCriterion):
         if self.task.goal == HIDE:
             return super().gap(evidence)
         own, limit, others = self.split(evidence)
-        best = others.amax(-1)
         # Without a target, any other class must exceed both the true class and the limit.
         if self.target is None:
-            return best - own.maximum(limit)
-        target = torch.where(self.target == NO_CLASS, others.argmax(-1), self.target)
+            return others.amax(-1) - own.maximum(limit)
+        target = self.target[..., None]
         # The target must exceed all other classes and the limit, which is the last column.
-        rest = evidence.scatter(-1, target[..., None], -torch.inf).amax(-1)
-        return evidence.gather(-1, target[..., None])[..., 0] - rest
+        rest = evidence.scatter(-1, target, -torch.inf).amax(-1)
+        return evidence.gather(-1, target)[..., 0] - rest
 
     def predicted(self, evidence: Float[Tensor, "... K"]) -> Int[Tensor, " ..."]:
         """Return the true class while it is found or, to mislabel, while no other is better."""
+        predicted = super().predicted(evidence)
         if self.task.goal == HIDE:
-            return super().predicted(evidence)
+            return predicted
         own, limit, others = self.split(evidence)
         best, index = others.max(-1)
-        # The index C stands for no class.
-        nothing = torch.full_like(index, self.class_count)
-        is_other = (best > own) & (best >= limit)
-        return torch.where(is_other, index, torch.where(own >= limit, self.source, nothing))
+        return torch.where((best > own) & (best >= limit), index, predicted)
 
     def reached_in_views(self, predicted: Int[Tensor, " ..."]) -> Tensor:
         """Return a mask of the views that reach the criterion. Nothing is no other class."""
