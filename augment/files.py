@@ -160,11 +160,6 @@ def reading_network(name: str | Path, fault: str, advice: str) -> AbstractContex
     return reading(f"name={name}", fault, advice, "name")
 
 
-def weights_error(path: str | Path, reason: str) -> InputError:
-    """Return an error about the argument `weights`, a file."""
-    return InputError(f"weights={path} {reason}", "weights")
-
-
 def import_package(package: str, name: str, install: str = "") -> Any:
     """Import an optional package, which the network of a given name needs."""
     advice = f"pip install {install or package}"
@@ -443,13 +438,13 @@ def read_weights(path: Path) -> State:
         return _without_prefixes(_state_dict(content))
     # torch and safetensors raise many kinds of errors for damaged files.
     except Exception as error:
-        if (advice := advice_for_pickles(path)) is not None:
-            raise weights_error(path, f"cannot be loaded, because it {advice}") from error
         reason = textwrap.shorten(str(error), 200)
         if isinstance(error, pickle.UnpicklingError):
             reason = "it is not a file of weights, or contains other objects"
-        advice = "save a network's state_dict() alone"
-        raise weights_error(path, f"cannot be read ({reason}): {advice}") from error
+        fault = f"cannot be read ({reason}): save a network's state_dict() alone"
+        if (advice := advice_for_pickles(path)) is not None:
+            fault = f"cannot be loaded, because it {advice}"
+        raise InputError(f"weights={path} {fault}", "weights") from error
 
 
 def _state_dict(content: Any) -> State:

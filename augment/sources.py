@@ -428,8 +428,8 @@ def load_source(
     elif source != "hf":
         files.require_no_facts(name, NetworkFacts(prompt=facts.prompt, task=facts.task))
     if path is not None and (known is None or source in ("hf", "python")):
-        reason = f"cannot be combined with {name}, which has its own weights: leave weights out"
-        raise files.weights_error(path, reason)
+        fault = f"weights={path} cannot be combined with {name}, which has its own weights"
+        raise InputError(f"{fault}: leave weights out", "weights")
     with progress.progress_message(f"loading {name}"):
         if known is None:
             return files.load_file(name, facts, trust_code)

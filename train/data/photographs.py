@@ -95,12 +95,6 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
     return photographs
 
 
-def class_folders(folder: Path, classes: Sequence[str]) -> list[str]:
-    """List the classes for which a folder has a subfolder."""
-    names = {*folder_names(folder)}
-    return sorted(name for name in classes if composed(name) in names)
-
-
 def choose_labels(
     folder: Path, classes: Sequence[str], label: str | int | Sequence[str | int] | None
 ) -> list[str]:
