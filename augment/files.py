@@ -243,12 +243,8 @@ class Scripted(Network):
         with warnings.catch_warnings(action="ignore"):  # Ignore that torch.jit is deprecated.
             torch.jit.save(self.network, content)
             content.seek(0)
-            copied = type(self)(torch.jit.load(content))
-        for weight, copied_weight in zip(self.parameters(), copied.parameters(), strict=True):
-            copied_weight.requires_grad_(weight.requires_grad)
-        for module, copied_module in zip(self.modules(), copied.modules(), strict=True):
-            copied_module.training = module.training
-        return copied
+            # The file keeps the modes of the modules, and `requires_grad` of the weights.
+            return type(self)(torch.jit.load(content))
 
 
 def _read_exported(path: Path) -> Content:
