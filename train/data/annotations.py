@@ -136,18 +136,14 @@ def read_masks(folder: Path) -> tuple[list[Annotated], dict[str, Path], list[str
             break
     else:
         raise InputError(f"photos={folder} lacks images/ or masks/: move them there", "photos")
-    marked, paths, missing = [], {}, []
-    for item in find_unlabeled(images):
-        name = str(item.path)
-        mask = (masks / item.path).with_suffix(".png")
-        if mask.is_file():
-            marked.append(_annotated(images / item.path, name, None, []))
-            paths[name] = mask
-        else:
-            missing.append(name)
-    if not marked:
+    shown = [str(item.path) for item in find_unlabeled(images)]
+    all_paths = {name: (masks / name).with_suffix(".png") for name in shown}
+    paths = {name: path for name, path in all_paths.items() if path.is_file()}
+    missing = [name for name in shown if name not in paths]
+    if not paths:
         first = Path(missing[0]).with_suffix(".png")
         raise InputError(f"{masks} has no mask {first}: add it", "photos")
+    marked = [_annotated(images / name, name, None, []) for name in paths]
     return marked, paths, missing
 
 
