@@ -75,11 +75,6 @@ class Annotated:
     is_crowd: Bool[np.ndarray, " M"]
     is_stored: bool = False
 
-    @property
-    def source(self) -> str:
-        """Folder of the photograph in its name. Empty without one."""
-        return self.name.rpartition("/")[0]
-
 
 @dataclass(frozen=True)
 class Annotations:
