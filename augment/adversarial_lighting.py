@@ -19,7 +19,7 @@ from augment.network import frozen_eval_mode
 from augment.scene.lights import LightModel
 from augment.settings import NO_CLASS_PIXEL
 from augment.tasks.classification import Classification
-from augment.tasks.detection import FINAL, Detection
+from augment.tasks.detection import Detection
 from augment.tasks.segmentation import BACKGROUND, Segmentation
 from augment.tasks.task import NO_GRADIENT, Criterion, Task
 from renderer import errors
@@ -182,9 +182,7 @@ class AdversarialLighting:
                 raise InputError(f"targets has no boxes or no labels: give {expected}")
             reader = Detection().reader("targets: the data set", len(classes))
             found = (_as_found(item["boxes"], item["labels"]) for item in given)
-            outputs = [reader.checked(FINAL, item, unit) for item in found]
-            for output in outputs:
-                reader.require_possible(output, *unit.shape[2:])
+            outputs = [reader.detections(item, unit, is_raw=False) for item in found]
         else:
             outputs, classes = self._as_outputs(targets, unit)
         if len(outputs) != len(unit):

@@ -262,8 +262,7 @@ class AttackSettings(ParameterSettings):
     @property
     def query_limit_of_start(self) -> int | None:
         """Largest number of images that an example may show in each start. None for no limit."""
-        limit = self.query_limit
-        return None if limit is None else limit // (1 + self.restarts)
+        return self.query_limit and self.query_limit // (1 + self.restarts)
 
     @property
     def step_limit(self) -> int:
@@ -276,8 +275,7 @@ class AttackSettings(ParameterSettings):
 
     def with_budget(self, factor: int) -> Self:
         """Return settings whose largest numbers of steps and queries are multiplied by a factor."""
-        query_limit = self.query_limit
-        max_queries = None if query_limit is None else factor * query_limit
+        max_queries = self.query_limit and factor * self.query_limit
         return replace(self, max_steps=factor * self.max_steps, max_queries=max_queries)
 
     @property

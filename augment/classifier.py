@@ -167,13 +167,12 @@ class TaskNetwork(CheckedNetwork):
                 Also if the network fails, or returns anything but finite logits
                 with a gradient.
         """
-        shape = (3, *height_and_width(self.size))
         if isinstance(images, Tensor | np.ndarray) and images.dtype in (torch.uint8, np.uint8):
             advice = "use floating-point RGB in [0, 1], such as images / 255"
             raise InputError(f"images is {errors.describe(images)}: {advice}")
         images = errors.as_tensor("images", images)
-        if images.shape[1:] != shape:
-            errors.require_shape(f"images of {self.title}", images, "N", *shape)
+        shape = (3, *height_and_width(self.size))
+        errors.require_shape(f"images of {self.title}", images, "N", *shape)
         outputs = super().forward(images)
         # The check may wait until the GPU is idle, so the network is called before.
         if len(images):

@@ -256,8 +256,7 @@ def _renders(
             depth = None if maps_of is None else maps_of[row, 0]
             normals = None if maps_of is None else maps_of[row, 1:]
             seen = labels, boxes, masks, visible, depth, normals
-            shown = scene.examples[example]
-            name = scene.objects[shown.object].name
+            name = scene.objects[scene.examples[example].object].name
             yield LabeledRender(start + example, images[row], *seen, facts, lights[row], name)
 
 
@@ -269,7 +268,6 @@ def describe_camera(camera: Camera, shape: tuple[int, int]) -> dict[str, Any]:
     height, width = shape
     # Focal length in pixels: at `distance`, the camera sees `camera.width` across.
     focal = width * camera.distance / camera.width
-    facts |= {"fx": focal, "fy": focal * camera.pixel_aspect}
-    facts["cx"] = width / 2 * (1 + camera.principal_right)
-    facts["cy"] = height / 2 - width / 2 * camera.principal_up
-    return facts
+    center_x = width / 2 * (1 + camera.principal_right)
+    center_y = height / 2 - width / 2 * camera.principal_up
+    return facts | {"fx": focal, "fy": focal * camera.pixel_aspect, "cx": center_x, "cy": center_y}

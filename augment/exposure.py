@@ -97,8 +97,6 @@ def normalize_light(images: Float[Tensor, "N 3 H W"], settings: NormalizedLightS
     factors = settings.level / percentiles(balanced, settings.percentile).clamp(min=DARKEST)
     encoded = encode(clamp(balanced * factors.view(-1, 1, 1, 1)), "srgb")
 
-    if settings.gamma == 1:
-        return encoded
     # x^gamma is x · x^(gamma - 1). The second factor would be infinite at 0 if gamma is below 1.
     return encoded * encoded.clamp(min=DARKEST_ENCODED) ** (settings.gamma - 1)
 

@@ -9,7 +9,6 @@ import argparse
 import importlib
 import io
 import json
-import math
 import pickle
 import re
 import sys
@@ -32,14 +31,14 @@ from torch.utils._pytree import tree_leaves, tree_map
 from augment import classifier as classifiers
 from augment import network as wrappers
 from augment.classifier import Classifier, TaskNetwork
-from augment.network import FILE, YOU, Network, say_once, unwrapped
+from augment.network import FILE, YOU, Inputs, Network, say_once, unwrapped
 from augment.tasks.task import Task
 from renderer.errors import InputError, explained, reading, require_file, require_kind, single_line
 from renderer.settings import MAX_SIZE, Size, as_size, height_and_width
 
 # A network from images (N, 3, height, width) to logits, and the sizes of the four dimensions of its
 # images. None stands for any size, or an unknown one.
-Content = tuple[Callable[[Tensor], Tensor], Sequence[int | None]]
+Content = tuple[nn.Module, Sequence[int | None]]
 
 # Weights of a network by their names.
 State = Mapping[str, Tensor]
@@ -76,15 +75,16 @@ _PERMITTED += [(_SCALAR, f"numpy.{core}.multiarray.scalar") for core in ("core",
 _PREFIXES = ("module.", "_orig_mod.", "model.", "network.", "net.")
 
 
-@dataclass(frozen=True)
+@dataclass
 class NetworkFacts:
     """Classes, image size and normalization that the user gives for a network.
 
     None leaves the choice to the source of the network, such as torchvision.
 
     Attributes:
-        classes: Names of the classes in the order of the outputs. If neither
-            the user nor the source gives names, they are "0", "1" and so on.
+        classes: Names of the classes in the order of the outputs, or a text file with a name in
+            each line, which is read. If neither the user nor the source gives names, they are "0",
+            "1" and so on.
         size: Pixels per side of the images, or height and width.
         normalization: "imagenet", or mean and standard deviation of the
             channels red, green and blue, in units of [0, 1].
@@ -92,37 +92,36 @@ class NetworkFacts:
         task: What the outputs mean, for a file that contains a network.
     """
 
-    classes: tuple[str, ...] | None = None
+    classes: Any = None
     size: Size | None = None
     normalization: classifiers.Normalization = None
     prompt: str | None = None
     task: Task | None = None
 
+    def __post_init__(self) -> None:
+        """Check the facts, and read the file of the classes."""
+        if isinstance(self.classes, str | Path):
+            require_file(self.classes, "give a text file with the name of a class in each line")
+            self.classes = [*filter(None, read_lines(Path(self.classes)))]
+        if self.classes is not None:
+            self.classes = classifiers.as_class_names("classes", self.classes)
+        if self.size is not None:
+            self.size = as_size("size", self.size, MAX_SIZE)
+        classifiers.mean_and_std(self.normalization)
+        require_kind("prompt", self.prompt, str | None, "a text with {} for the name of a class")
+        expected = "a task, such as nb.Detection(decode=function)"
+        require_kind("task", self.task, Task | None, expected)
 
-def as_facts(
-    classes: Sequence[str] | str | Path | None = None,
-    size: Size | None = None,
-    normalization: classifiers.Normalization = None,
-    prompt: str | None = None,
-    task: Task | None = None,
-) -> NetworkFacts:
-    """Check what the user gives about a network.
+    def inputs(self, size: str | None, normalization: str | None) -> Inputs:
+        """Return who states the facts about the images of a network, besides the user."""
+        normalization = normalization if self.normalization is None else YOU
+        return Inputs(YOU if self.size else size, normalization, normalization)
 
-    Classes may be a text file with a name in each line.
-    """
-    if isinstance(classes, str | Path):
-        require_file(classes, "give a text file with the name of a class in each line")
-        with reading(Path(classes), "is no text in UTF-8", "save it as UTF-8"):
-            lines = Path(classes).read_text(encoding="utf-8-sig").splitlines()
-        classes = [line.strip() for line in lines if line.strip()]
-    names = None if classes is None else classifiers.as_class_names("classes", classes)
-    if size is not None:
-        size = as_size("size", size, MAX_SIZE)
-    if normalization is not None:
-        classifiers.mean_and_std(normalization)
-    require_kind("prompt", prompt, str | None, "a text with {} for the name of a class")
-    require_kind("task", task, Task | None, "a task, such as nb.Detection(decode=function)")
-    return NetworkFacts(names, size, normalization, prompt, task)
+
+def read_lines(path: Path) -> list[str]:
+    """Read the lines of a text file, without spaces at their ends. Some may be empty."""
+    with explained(f"{path} is no text in UTF-8", "save it as UTF-8"):
+        return [line.strip() for line in path.read_text(encoding="utf-8-sig").splitlines()]
 
 
 def require_no_facts(name: str, facts: NetworkFacts) -> None:
@@ -139,10 +138,8 @@ def is_network_file(name: str) -> bool:
     The suffix decides. Only for .pt and similar suffixes, which files of weights
     have, too, the file must also exist and be TorchScript.
     """
-    path = Path(name)
-    if path.suffix.lower() in TORCHSCRIPT:
-        return path.is_file() and is_torchscript(path)
-    return path.suffix.lower() in SUFFIXES
+    suffix = Path(name).suffix.lower()
+    return suffix in (EXPORTED, ONNX) or (suffix in TORCHSCRIPT and is_torchscript(Path(name)))
 
 
 def name_from_anywhere(name: str) -> str:
@@ -161,11 +158,6 @@ def name_error(name: str | Path, reason: str) -> InputError:
 def reading_network(name: str | Path, fault: str, advice: str) -> AbstractContextManager[None]:
     """Name a network in the errors of its files or of a connection."""
     return reading(f"name={name}", fault, advice, "name")
-
-
-def weights_error(path: str | Path, reason: str) -> InputError:
-    """Return an error about the argument `weights`, a file."""
-    return InputError(f"weights={path} {reason}", "weights")
 
 
 def import_package(package: str, name: str, install: str = "") -> Any:
@@ -196,10 +188,9 @@ def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> TaskNetwork:
     if batch_size is not None:
         # The file takes batches of one size only. `InBatches` splits other numbers of images.
         network = InBatches(network, batch_size, batch_size)
-    if isinstance(network, nn.Module):
-        # Set the mode without a call of `eval`, which networks of torch.export refuse.
-        for module in network.modules():
-            module.training = False
+    # Set the mode without a call of `eval`, which networks of torch.export refuse.
+    for module in network.modules():
+        module.training = False
     # Images are square if the file fixes one side only. None if it fixes no side.
     size_in_file = (height, width) if height and width else height or width
     given = facts.size or size_in_file, facts.classes, facts.normalization
@@ -213,10 +204,8 @@ def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> TaskNetwork:
 def _require_evaluation_outputs(classifier: Classifier, name: str) -> None:
     """Raise InputError if logits are random or depend on other images (exported training mode)."""
     shape = (3, 3, *height_and_width(classifier.size))
-    # Three images of gray levels in random order, the same in each call.
-    levels = torch.linspace(0, 1, math.prod(shape))
-    images = levels[torch.randperm(len(levels), generator=torch.Generator().manual_seed(0))]
-    images = images.view(shape)
+    # Three random images, the same in each call.
+    images = torch.rand(shape, generator=torch.Generator().manual_seed(0))
     # Show the first image beside the second and then beside the third. Its logits must not change.
     with torch.no_grad():
         outputs = [classifier.network(images[[0, other]]) for other in (1, 2)]
@@ -254,12 +243,8 @@ class Scripted(Network):
         with warnings.catch_warnings(action="ignore"):  # Ignore that torch.jit is deprecated.
             torch.jit.save(self.network, content)
             content.seek(0)
-            copied = type(self)(torch.jit.load(content))
-        for weight, copied_weight in zip(self.parameters(), copied.parameters(), strict=True):
-            copied_weight.requires_grad_(weight.requires_grad)
-        for module, copied_module in zip(self.modules(), copied.modules(), strict=True):
-            copied_module.training = module.training
-        return copied
+            # The file keeps the modes of the modules, and `requires_grad` of the weights.
+            return type(self)(torch.jit.load(content))
 
 
 def _read_exported(path: Path) -> Content:
@@ -449,13 +434,13 @@ def read_weights(path: Path) -> State:
         return _without_prefixes(_state_dict(content))
     # torch and safetensors raise many kinds of errors for damaged files.
     except Exception as error:
-        if (advice := advice_for_pickles(path)) is not None:
-            raise weights_error(path, f"cannot be loaded, because it {advice}") from error
         reason = textwrap.shorten(str(error), 200)
         if isinstance(error, pickle.UnpicklingError):
             reason = "it is not a file of weights, or contains other objects"
-        advice = "save a network's state_dict() alone"
-        raise weights_error(path, f"cannot be read ({reason}): {advice}") from error
+        fault = f"cannot be read ({reason}): save a network's state_dict() alone"
+        if (advice := advice_for_pickles(path)) is not None:
+            fault = f"cannot be loaded, because it {advice}"
+        raise InputError(f"weights={path} {fault}", "weights") from error
 
 
 def _state_dict(content: Any) -> State:

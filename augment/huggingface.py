@@ -5,7 +5,6 @@ segmenters give the output of transformers, which a task reads.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +16,8 @@ from PIL import Image
 from torch import Tensor, nn
 
 from augment.classifier import IMAGENET, USUAL_SIZE, TaskNetwork, as_network, mean_and_std
-from augment.files import NetworkFacts, import_package, name_error, reading_network, weights_error
-from augment.network import FILE, YOU, ChannelNormalization, Inputs, Network
+from augment.files import NetworkFacts, import_package, name_error, reading_network
+from augment.network import FILE, ChannelNormalization, Network
 from renderer.errors import InputError
 from renderer.settings import Size, height_and_width
 
@@ -59,12 +58,9 @@ class ZeroShot(nn.Module):
         return self.text(F.normalize(getattr(features, "pooler_output", features), dim=-1))
 
 
-def load(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool) -> TaskNetwork:
+def load(model: str, _: Path | None, facts: NetworkFacts, is_random: bool) -> TaskNetwork:
     """Load or build a network of transformers: a folder, or a repository of the Hub."""
     name = f"hf:{model}"
-    if weights is not None:
-        reason = f"cannot be combined with {name}, which has weights: leave weights out"
-        raise weights_error(weights, reason)
     library = import_package("transformers", name, '"parametric-norm-balls[hf]"')
     advice = "give a folder that save_pretrained wrote, or a repository of the Hugging Face Hub"
     with reading_network(name, "cannot be read", advice):
@@ -87,19 +83,17 @@ def load(model: str, weights: Path | None, facts: NetworkFacts, is_random: bool)
 
     network = _model(getattr(library, architecture), model, config, name, is_random)
     # What the user gives replaces what the files state.
-    size, mean, std, is_bgr, inputs = _read_preprocessor(library, model, config, name)
+    size, mean, std, is_bgr, *sources = _read_preprocessor(library, model, config)
+    size = facts.size or size
     if facts.normalization is not None:
         mean, std = mean_and_std(facts.normalization)
-        inputs = replace(inputs, normalization=YOU, value_range=YOU)
-    if facts.size is not None:
-        size, inputs = facts.size, replace(inputs, size=YOU)
     normalization = ChannelNormalization(mean, std, is_bgr)
     if is_zero_shot:
         gray = normalization(torch.full((1, 3, *height_and_width(size)), 0.5))
         network = _zero_shot(library, network, model, facts, gray, is_random)
     normalized = Network(network.eval(), [normalization])
     made = as_network(normalized, size, facts.classes, name=name, says=False)
-    made.inputs = inputs
+    made.inputs = facts.inputs(*sources)
     return made
 
 
@@ -123,13 +117,13 @@ def _model(kind: Any, model: str, config: Any, name: str, is_random: bool) -> An
 
 
 def _read_preprocessor(
-    library: Any, model: str, config: Any, name: str
-) -> tuple[Size, Sequence[float], Sequence[float], bool, Inputs]:
+    library: Any, model: str, config: Any
+) -> tuple[Size, Sequence[float], Sequence[float], bool, str | None, str | None]:
     """Find out how the images of a network are prepared, and who states it.
 
-    Return the size, mean and standard deviation in units of [0, 1], and whether blue is the first
-    channel. Images of one color are prepared, so that rescaling, shifts and the order of
-    the channels count, however the processor defines them.
+    Return the size, mean and standard deviation in units of [0, 1], whether blue is the first
+    channel, and who states the size and the normalization. Images of one color are prepared, so
+    that rescaling, shifts and the order of the channels count, however the processor defines them.
     """
     try:
         processor: Any = library.AutoImageProcessor.from_pretrained(model, **NO_CODE)
@@ -152,7 +146,7 @@ def _read_preprocessor(
     size: Size = of_config if isinstance(of_config, int) else USUAL_SIZE
     sizer = FILE if isinstance(of_config, int) else None
     if processor is None:
-        return size, *mean_and_std(IMAGENET), False, Inputs(sizer, None, None)
+        return size, *mean_and_std(IMAGENET), False, sizer, None
     # Images of two sizes become images of one size if the processor resizes to a fixed size.
     shapes = {tuple(prepare((0, 0, 0), side).shape) for side in PROBED}
     if source and len(shapes) == 1:
@@ -167,7 +161,7 @@ def _read_preprocessor(
     # The value x of a channel becomes gain · x + black, which is (x − mean) / std.
     own_gain = (gain.flip(1) if is_bgr else gain).diagonal()
     mean, std = (-black / own_gain).tolist(), (1 / own_gain).tolist()
-    return size, mean, std, is_bgr, Inputs(sizer, source, source)
+    return size, mean, std, is_bgr, sizer, source
 
 
 @torch.no_grad()

@@ -387,8 +387,6 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
         dtype = str(image.dtype).removeprefix("torch.")
         fault = f"the image is {dtype} of shape {tuple(image.shape)}"
         raise InputError(f"{fault}: give numbers of shape (..., C, H, W) with 1 to 4 channels")
-    if plain.is_complex():
-        raise InputError(f"the image is {image.dtype}: give real numbers")
     count = math.prod(_batch_shape(image))
     if not plain.numel() or plain.is_meta or not any(lights):
         return plain

@@ -466,9 +466,8 @@ def frozen_eval_mode(network: nn.Module) -> Iterator[None]:
 
 def device_of(network: object) -> torch.device:
     """Return the device of the parameters of a network. It is the CPU if there are none."""
-    parameters = network.parameters() if isinstance(network, nn.Module) else iter(())
-    first = next(parameters, None)
-    return torch.device("cpu") if first is None else first.device
+    parameters = network.parameters() if isinstance(network, nn.Module) else ()
+    return next((parameter.device for parameter in parameters), torch.device("cpu"))
 
 
 @contextmanager

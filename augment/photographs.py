@@ -76,7 +76,7 @@ class RelitPhotographs(NormBalls):
         self._albedo = albedo
         self._light = light
         self._cells = settings.cells
-        self._generators = generators
+        self.generators = generators
 
     def log_gain(self, values: Float[Tensor, "A D"]) -> Float[Tensor, "A 3 cells cells"]:
         """Return the logarithms of the factors of each channel in each cell."""
@@ -87,11 +87,6 @@ class RelitPhotographs(NormBalls):
         light = ProjectedLight(*(values[examples] for values in self._light))
         return light.expose(self._albedo[examples], self.log_gain(values))[:, None]
 
-    def draw(self, examples: Examples) -> Float[Tensor, "A D"]:
-        """Draw random factors of some photographs, whose logarithms are uniform in the ball."""
-        draws = [(self.start[[row]], self._generators[row]) for row in examples.tolist()]
-        return torch.cat([sample(self.settings, *each) for each in draws])
-
 
 class UniformDraws(Optimizer):
     """Independent draws from the norm-ball, of which the best is kept."""
@@ -99,8 +94,10 @@ class UniformDraws(Optimizer):
     problem: RelitPhotographs
 
     def ask(self, rows: Int[Tensor, " N"]) -> Float[Tensor, "N 1 D"]:
-        """Draw values of each photograph."""
-        return self.problem.draw(self.examples[rows])[:, None]
+        """Draw factors of each photograph, whose logarithms are uniform in the ball."""
+        problem, examples = self.problem, self.examples[rows].tolist()
+        draws = [(problem.start[[row]], problem.generators[row]) for row in examples]
+        return torch.stack([sample(problem.settings, *each) for each in draws])
 
 
 @dataclass(frozen=True, repr=False)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -24,7 +24,6 @@ from augment.classifier import CheckedNetwork
 from augment.progress import Phases
 from augment.renders import SHOWN_EXAMPLES, AttackExamples, Renders
 from augment.scene.build import MeshItem, build_scene, warn_of_exposure, with_needed_degree
-from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from augment.scene.truth import NO_OBJECT, Truth
 from augment.scene.vary import vary
@@ -583,14 +582,12 @@ def _changes(problem: SceneProblem, values: Float[Tensor, "E D"]) -> dict[str, f
     """Compute the L2 norm of each change, such as "light_change", averaged over the examples."""
     before = problem.conditions(problem.start, problem.all_examples)
     after = problem.conditions(values, problem.all_examples)
-    changes = {}
     # Fields that are None are not attacked.
-    for condition in fields(Conditions):
-        new_values = getattr(after, condition.name)
-        if new_values is not None:
-            difference = new_values - getattr(before, condition.name)
-            changes[f"{condition.name}_change"] = _mean(difference.flatten(1).norm(dim=1))
-    return changes
+    return {
+        f"{name}_change": _mean((changed - getattr(before, name)).flatten(1).norm(dim=1))
+        for name, changed in vars(after).items()
+        if changed is not None
+    }
 
 
 def _mean(values: Tensor) -> float:

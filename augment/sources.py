@@ -22,7 +22,7 @@ from augment import files, huggingface, progress
 from augment import network as wrappers
 from augment.classifier import Classifier, Normalization, as_network, mean_and_std
 from augment.files import NetworkFacts, State
-from augment.network import FILE, YOU, ChannelNormalization, Inputs, Network, unwrapped
+from augment.network import FILE, ChannelNormalization, Network, unwrapped
 from augment.settings import PYTHON, NormalizeLight, split_function
 from augment.tasks.classification import nearest
 from augment.tasks.task import Task
@@ -65,14 +65,8 @@ def _classifier(
         mean, std = mean_and_std(facts.normalization)
     normalized = Network(network, [ChannelNormalization(mean, std, bgr)])
     classifier = Classifier(normalized, facts.size or size, facts.classes or classes, name)
-    classifier.inputs = _inputs_of(facts, library, library)
+    classifier.inputs = facts.inputs(library, library)
     return classifier
-
-
-def _inputs_of(facts: NetworkFacts, size: str | None, normalization: str | None) -> Inputs:
-    """Return who states the facts about the images of a network, besides the user."""
-    normalization = normalization if facts.normalization is None else YOU
-    return Inputs(YOU if facts.size else size, normalization, normalization)
 
 
 def _torchvision(
@@ -167,7 +161,7 @@ def _with_weights(
     if all_facts != facts:
         classifier = build(all_facts)
     if not is_published:
-        classifier.inputs = _inputs_of(facts, FILE if all_facts.size else None, None)
+        classifier.inputs = facts.inputs(FILE if all_facts.size else None, None)
     return files.fill(classifier, state, source)
 
 
@@ -319,11 +313,8 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
     return network, size, classes
 
 
-def _python(name: str, weights: Path | None, *_: object) -> Any:
+def _python(name: str, *_: object) -> Any:
     """Load a classifier by a Python function that the user wrote, which chooses its weights."""
-    if weights is not None:
-        reason = f"cannot be combined with python:{name}, a function that loads the weights itself"
-        raise files.weights_error(weights, f"{reason}: leave weights out")
     network, size, classes = call_python(name)
     if isinstance(network, nn.Module):
         wrappers.keep_text_vectors(network.eval(), len(classes))
@@ -409,17 +400,20 @@ def load_classifier(
     """
     require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     path = None if weights is None else as_path("weights", weights)
-    facts = files.as_facts(classes, size, normalization, prompt, task)
+    facts = NetworkFacts(classes, size, normalization, prompt, task)
     require_flag("trust_code", trust_code)
     classifier = load_source(name, path, facts, trust_code)
     wrappers.say_inputs(classifier.name, classifier.network, classifier.size, classifier.inputs)
     return classifier.normalizing_light(normalize_light)
 
 
-def load_source(name: str, path: Path | None, facts: NetworkFacts, trust_code: bool) -> Any:
+def load_source(
+    name: str, path: Path | None, facts: NetworkFacts, trust_code: bool, is_random: bool = False
+) -> Any:
     """Load a network by name, without the normalization of light, and without any message.
 
-    `path` is a file of weights. None stands for the weights of the source.
+    `path` is a file of weights. None stands for the weights of the source. Random weights replace
+    them with `is_random`, but not those of a file with a network and of a Python function.
     """
     # A name is "source:model", or the name of a source or a file without a colon.
     source, colon, model = name.partition(":")
@@ -429,26 +423,14 @@ def load_source(name: str, path: Path | None, facts: NetworkFacts, trust_code: b
             choices = [f"{choice}NAME" if choice.endswith(":") else choice for choice in SOURCES]
             choices.append(f"a file ({', '.join(files.SUFFIXES)})")
             raise files.name_error(name, f"is not known: choose one of {', '.join(choices)}")
-        if path is not None:
-            reason = f"cannot be combined with {name}, a file that contains weights"
-            raise files.weights_error(path, f"{reason}: leave weights out")
-    elif source + colon not in ("torchvision:", "timm:", "hf:"):
+    elif not is_random and source + colon not in ("torchvision:", "timm:", "hf:"):
         files.require_no_facts(name, facts)
     elif source != "hf":
         files.require_no_facts(name, NetworkFacts(prompt=facts.prompt, task=facts.task))
+    if path is not None and (known is None or source in ("hf", "python")):
+        fault = f"weights={path} cannot be combined with {name}, which has its own weights"
+        raise InputError(f"{fault}: leave weights out", "weights")
     with progress.progress_message(f"loading {name}"):
         if known is None:
             return files.load_file(name, facts, trust_code)
-        return known(*([model] if colon else []), path, facts, False)
-
-
-def build_classifier(name: str, facts: NetworkFacts, trust_code: bool = False) -> Any:
-    """Build a classifier with random weights.
-
-    A Python function of the user chooses weights and size itself, and a file contains its weights.
-    These classifiers are loaded as they are.
-    """
-    source, colon, model = name.partition(":")
-    if source + colon not in SOURCES:
-        return files.load_file(name, facts, trust_code)
-    return SOURCES[source + colon](*([model] if colon else []), None, facts, True)
+        return known(*([model] if colon else []), path, facts, is_random)

@@ -1,13 +1,13 @@
 """A second network for images in some light, beside another network for all other images."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 # A name that begins with one of these texts names a network, and a second one after a "+".
@@ -35,7 +35,12 @@ class Switch(nn.Module):
             return self.other(images)
         # Place of each image among the outputs of both networks.
         places = torch.cat([(~is_chosen).nonzero(), is_chosen.nonzero()])[:, 0].argsort()
-        return _joined([self.network(images[~is_chosen]), self.other(images[is_chosen])], places)
+        outputs = [self.network(images[~is_chosen]), self.other(images[is_chosen])]
+        if isinstance(outputs[0], Tensor):
+            return torch.cat(outputs)[places]
+        # Detectors return a list with an entry for each image.
+        rows = [row for part in outputs for row in part]
+        return [rows[place] for place in places.tolist()]
 
     def extra_repr(self) -> str:
         """Write what chooses, on which the keys of stored logits depend."""
@@ -79,17 +84,3 @@ def statistics(
             hooks.enter_context(layer.register_forward_hook(partial(note, name)))
         network(images)
     return torch.cat([found[name] for name in layers], 1).float()
-
-
-def _joined(outputs: list[Any], places: Int[Tensor, " N"]) -> Any:
-    """Join outputs of several batches of images, and put them in another order."""
-    first = outputs[0]
-    if isinstance(first, Tensor):
-        return torch.cat(outputs)[places]
-    if isinstance(first, Mapping):
-        # Outputs of transformers have keys without values.
-        given = [key for key, value in first.items() if value is not None]
-        parts = {key: [item[key] for item in outputs] for key in given}
-        return type(first)(**{key: _joined(values, places) for key, values in parts.items()})
-    rows = [row for item in outputs for row in item]
-    return [rows[place] for place in places.tolist()]

@@ -38,7 +38,7 @@ from PIL import Image
 
 from augment.classifier import Classifier
 from augment.files import NetworkFacts
-from augment.sources import build_classifier
+from augment.sources import load_source
 from benchmarks.common import write_csv
 from renderer.light.environment import read_map
 from train.checkpoints import is_classifier, load_network, load_run
@@ -361,7 +361,7 @@ def load(name: str, size: int) -> Classifier:
     if not is_classifier(source):
         # The name of a folder may contain "=".
         return load_run(name)
-    classifier = build_classifier(source, NetworkFacts(size=size))
+    classifier = load_source(source, None, NetworkFacts(size=size), False, is_random=True)
     classifier.load_state_dict(load_network(source, weights or None).state_dict())
     return classifier
 

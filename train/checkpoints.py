@@ -24,7 +24,7 @@ from torch import Tensor, cuda
 
 from augment.classifier import Classifier, OperatingPoint, TaskNetwork
 from augment.exposure import DIM, with_normalized_light
-from augment.files import as_facts, is_network_file, require_no_facts
+from augment.files import NetworkFacts, is_network_file, require_no_facts
 from augment.network import FROM_FILE, Inputs, say_inputs, say_once
 from augment.settings import PYTHON, NormalizeLight, split_function
 from augment.sources import SOURCES, import_function, load_classifier
@@ -162,7 +162,7 @@ def load_network(
     if not name.startswith(RUN):
         options = {"normalize_light": normalize_light, "trust_code": trust_code}
         return load_classifier(name, weights, **options, **facts)
-    require_no_facts(name, as_facts(**facts))
+    require_no_facts(name, NetworkFacts(**facts))
     # Error messages about the argument `run` begin with `name` instead, the argument of
     # this function.
     with keyed(run="name"):

@@ -13,10 +13,10 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from augment import distributed
-from augment.files import as_facts
+from augment.files import NetworkFacts
 from augment.network import ChannelNormalization, Network, eval_mode, plain_outputs
 from augment.settings import PYTHON
-from augment.sources import build_classifier, call_python, require_architecture
+from augment.sources import call_python, load_source, require_architecture
 from renderer.errors import InputError, explained
 from renderer.settings import Size
 from train.settings import WIDERESNET
@@ -36,7 +36,7 @@ Color = Sequence[float]
 # Default mean and standard deviation of the pixels of the data, in red, green and blue.
 MEAN = (0.5, 0.5, 0.5)
 STD = (0.25, 0.25, 0.25)
-# Key in the description of a network. It is True if `augment.build_classifier` built
+# Key in the description of a network. It is True if `augment.sources.load_source` built
 # the network.
 CLASSIFIER = "classifier"
 
@@ -159,14 +159,15 @@ def build_network(
     """Build a network that maps images (N, 3, size, size), RGB in [0, 1], to logits.
 
     The name is "wideresnet", "torchvision:NAME", "python:MODULE:FUNCTION" or, with `classifier`, a
-    pretrained network of `augment.build_classifier`. "small_detector" finds boxes, see
+    pretrained network of `augment.sources.load_source`. "small_detector" finds boxes, see
     `train.detectors`. If mean and std are None, they are 0.5 and 0.25. A network of Python
     normalizes images itself. `shape` is for "wideresnet".
     """
     if classifier:
         normalization = None if mean is None or std is None else (mean, std)
-        facts = as_facts(classes, size, normalization)
-        return build_classifier(name, facts, trust_code).network.requires_grad_(True)
+        facts = NetworkFacts(classes, size, normalization)
+        built = load_source(name, None, facts, trust_code, is_random=True)
+        return built.network.requires_grad_(True)
     if name == DETECTOR:
         # torchvision's detectors are imported when they are needed, because that takes a second.
         from train.detectors import small_detector

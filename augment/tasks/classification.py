@@ -161,9 +161,7 @@ class ClassCriterion(Criterion):
         # the class.
         other_logits = logits.scatter(1, source[:, None], -torch.inf)
         odds = logits.gather(1, source[:, None])[:, 0] - other_logits.logsumexp(1)
-        is_added = odds > OVERCONFIDENT
-        if self.target is not None:
-            is_added = is_added & (self.target == NO_CLASS)
+        is_added = (odds > OVERCONFIDENT) & (self.targets == NO_CLASS)
         cost = F.logsigmoid(odds) + torch.where(is_added, odds - OVERCONFIDENT, 0)
         cost = torch.where(self.source == NO_CLASS, 0, cost)
         if self.target is None:
@@ -177,10 +175,9 @@ class ClassCriterion(Criterion):
         one, it is the largest logit of the other classes minus the logit of the source class. It is
         negative if the view does not reach the criterion.
         """
-        target = torch.full_like(self.source, NO_CLASS) if self.target is None else self.target
-        has_target = target != NO_CLASS
+        has_target = self.targets != NO_CLASS
         # Class whose logit is compared with the others, shape (..., 1).
-        compared_class = torch.where(has_target, target, self.source)[..., None]
+        compared_class = torch.where(has_target, self.targets, self.source)[..., None]
         compared_logit = logits.gather(-1, compared_class)[..., 0]
         largest_other = logits.scatter(-1, compared_class, -torch.inf).amax(-1)
         difference = compared_logit - largest_other

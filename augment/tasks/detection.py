@@ -270,9 +270,8 @@ class DetectionCriterion(ObjectCriterion):
     def cost(self, outputs: list[Detections]) -> Float[Tensor, " N"]:
         """Return the smooth maximum of the true class, minus that of the others to mislabel."""
         columns = torch.arange(self.class_count, device=self.source.device)
-        targets = self.source if self.target is None else self.target
         costs = []
-        rows = zip(outputs, self.boxes, self.source, targets, strict=True)
+        rows = zip(outputs, self.boxes, self.source, self.targets, strict=True)
         for item, box, source, target in rows:
             # Without candidates, the final boxes stand for them.
             boxes = item.get(CANDIDATE_BOXES, item["boxes"])
@@ -290,9 +289,8 @@ class DetectionCriterion(ObjectCriterion):
             # The smooth maximum log Σ exp gives all boxes near the object a gradient.
             cost = odds[:, source].logsumexp(0)
             if self.task.goal == MISLABEL:
-                has_target = self.target is not None and target != NO_CLASS
-                others = columns[columns == target] if has_target else columns[columns != source]
-                cost = cost - odds[:, others].flatten().logsumexp(0)
+                is_other = columns != source if target == NO_CLASS else columns == target
+                cost = cost - odds[:, is_other].flatten().logsumexp(0)
             costs.append(cost)
         return torch.stack(costs)
 
@@ -301,25 +299,22 @@ class DetectionCriterion(ObjectCriterion):
         if self.task.goal == HIDE:
             return super().gap(evidence)
         own, limit, others = self.split(evidence)
-        best = others.amax(-1)
         # Without a target, any other class must exceed both the true class and the limit.
         if self.target is None:
-            return best - own.maximum(limit)
-        target = torch.where(self.target == NO_CLASS, others.argmax(-1), self.target)
+            return others.amax(-1) - own.maximum(limit)
+        target = self.target[..., None]
         # The target must exceed all other classes and the limit, which is the last column.
-        rest = evidence.scatter(-1, target[..., None], -torch.inf).amax(-1)
-        return evidence.gather(-1, target[..., None])[..., 0] - rest
+        rest = evidence.scatter(-1, target, -torch.inf).amax(-1)
+        return evidence.gather(-1, target)[..., 0] - rest
 
     def predicted(self, evidence: Float[Tensor, "... K"]) -> Int[Tensor, " ..."]:
         """Return the true class while it is found or, to mislabel, while no other is better."""
+        predicted = super().predicted(evidence)
         if self.task.goal == HIDE:
-            return super().predicted(evidence)
+            return predicted
         own, limit, others = self.split(evidence)
         best, index = others.max(-1)
-        # The index C stands for no class.
-        nothing = torch.full_like(index, self.class_count)
-        is_other = (best > own) & (best >= limit)
-        return torch.where(is_other, index, torch.where(own >= limit, self.source, nothing))
+        return torch.where((best > own) & (best >= limit), index, predicted)
 
     def reached_in_views(self, predicted: Int[Tensor, " ..."]) -> Tensor:
         """Return a mask of the views that reach the criterion. Nothing is no other class."""

@@ -57,6 +57,11 @@ class Criterion(Rows, ABC):
     target: Int[Tensor, "*E V"] | None = None
 
     @property
+    def targets(self) -> Int[Tensor, "*E V"]:
+        """Target class of each view. NO_CLASS if there is none."""
+        return torch.full_like(self.source, NO_CLASS) if self.target is None else self.target
+
+    @property
     def view_count(self) -> int:
         """Number V of views of each example."""
         return self.source.shape[1]
@@ -92,11 +97,7 @@ class Criterion(Rows, ABC):
     def reached_in_views(self, predicted: Int[Tensor, " ..."]) -> Bool[Tensor, " ..."]:
         """Return a mask of the views that reach the criterion."""
         is_misclassified = predicted != self.source
-        if self.target is None:
-            return is_misclassified
-        # The target `NO_CLASS` stands for a view without a target.
-        is_untargeted = self.target == NO_CLASS
-        return torch.where(is_untargeted, is_misclassified, predicted == self.target)
+        return torch.where(self.targets == NO_CLASS, is_misclassified, predicted == self.targets)
 
 
 @dataclass(frozen=True)

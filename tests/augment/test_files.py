@@ -11,7 +11,7 @@ import safetensors.torch
 import torch
 from torch import nn
 
-from augment.files import as_facts, read_weights
+from augment.files import NetworkFacts, read_weights
 from augment.sources import load_classifier
 from renderer.errors import InputError
 
@@ -198,10 +198,10 @@ def test_a_file_of_class_names_of_windows_gives_the_names(tmp_path):
     """Notepad may write a byte-order mark and UTF-16, and ends lines by two characters."""
     path = tmp_path / "classes.txt"
     path.write_bytes(b"\xef\xbb\xbforange\r\ncup\r\n")
-    assert as_facts(path).classes == ("orange", "cup")
+    assert NetworkFacts(path).classes == ("orange", "cup")
     path.write_bytes("orange\ncup\n".encode("utf-16"))
     with pytest.raises(InputError, match="UTF-8"):
-        as_facts(path)
+        NetworkFacts(path)
 
 
 @pytest.mark.parametrize("module", [b"numpy._core.", b"numpy.core."])

@@ -254,7 +254,7 @@ def test_images_are_prepared_as_the_processor_states(kind, options, tmp_path):
     processor = getattr(transformers, f"{kind}ImageProcessor")(**options)
     processor.save_pretrained(tmp_path)
     folder = str(tmp_path)
-    size, mean, std, is_bgr, inputs = _read_preprocessor(transformers, folder, config, "hf:x")
+    size, mean, std, is_bgr, *sources = _read_preprocessor(transformers, folder, config)
     picture = photograph(2 * size)
     expected = processor(images=picture, return_tensors="pt")["pixel_values"]
     plain = getattr(transformers, f"{kind}ImageProcessor")(
@@ -265,7 +265,7 @@ def test_images_are_prepared_as_the_processor_states(kind, options, tmp_path):
     images = plain(images=picture, return_tensors="pt")["pixel_values"]
     got = ChannelNormalization(mean, std, is_bgr)(images)
     torch.testing.assert_close(got, expected, rtol=1e-4, atol=1e-4 * float(expected.abs().max()))
-    assert inputs.size == inputs.normalization == "preprocessor_config.json"
+    assert sources == ["preprocessor_config.json"] * 2
 
 
 def test_without_a_processor_the_normalization_is_assumed(save, caplog):

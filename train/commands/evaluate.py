@@ -8,18 +8,18 @@ from typing import Any
 import torch
 
 from augment.classifier import UNIT_RANGE, Classifier, Normalization, TaskNetwork, as_network
-from augment.files import as_facts, require_no_facts
+from augment.files import NetworkFacts, require_no_facts
 from augment.network import device_of, gradient_flags_kept, say_once
 from augment.settings import NormalizeLight
 from augment.tasks.detection import Detection
 from augment.tasks.segmentation import Segmentation
 from augment.tasks.task import Task
-from renderer.errors import InputError, as_folder, as_path, keyed, require_choice
+from renderer.errors import InputError, as_folder, as_path, composed, keyed, require_choice
 from renderer.settings import Size
 from train.checkpoints import load_chosen, load_run, with_task
 from train.command_settings import EvaluateSettings, require_calibration
 from train.data.annotations import FITS, LETTERBOX, read_annotations
-from train.data.photographs import choose_labels, class_folders, require_outside
+from train.data.photographs import choose_labels, folder_names, require_outside
 from train.device import MixedPrecision, choose_device, choose_precision
 from train.results import annotated_scores, scoring
 from train.results.annotated_scores import AnnotatedScores, Showing
@@ -40,7 +40,7 @@ def run(settings: EvaluateSettings) -> None:
         # The file of a training run has its classes, size and normalization. These settings
         # are therefore an error here.
         facts = settings.classes, settings.size, settings.normalization, settings.prompt
-        require_no_facts(f"run={settings.run}", as_facts(*facts))
+        require_no_facts(f"run={settings.run}", NetworkFacts(*facts))
         if settings.decode is not None:
             raise settings.wrong("decode", "is for a file, and not for a run: leave it out")
         loaded = load_run(settings.run, settings.weights, settings.network, settings.trust)
@@ -48,7 +48,7 @@ def run(settings: EvaluateSettings) -> None:
         network = with_task(loaded.normalizing_light(settings.normalize_light), settings)
         photos = published_folder(Path(settings.photos))
         # The run is scored on the positive classes of its training, if the folder has classes.
-        if label is None and class_folders(photos, network.classes):
+        if label is None and {*folder_names(photos)}.intersection(map(composed, network.classes)):
             label = trained_labels(Path(settings.run)) or None
     with keyed("label"):
         for name in [] if label is None else label_names(label):

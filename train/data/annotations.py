@@ -19,6 +19,7 @@ import yaml
 from jaxtyping import Bool, Float, Int, UInt8
 from PIL import ExifTags, Image
 
+from augment.files import read_lines
 from augment.settings import NO_CLASS_PIXEL
 from renderer.errors import InputError, explained
 from renderer.io.images import SUFFIXES, gray_factor, is_hidden, open_image, read_rgb
@@ -45,17 +46,9 @@ CLASS_FILES = ("classes.txt", "obj.names")
 ROUNDING = 1e-3
 # Number of photographs that a network sees at a time.
 BATCH = 16
-# From the coordinates (x, y) in a stored image, as fractions of its sides, to those in the upright
-# one, by the EXIF orientation. Only these exchange width and height.
-TURNED = {
-    2: lambda x, y: (1 - x, y),
-    3: lambda x, y: (1 - x, 1 - y),
-    4: lambda x, y: (x, 1 - y),
-    5: lambda x, y: (y, x),
-    6: lambda x, y: (1 - y, x),
-    7: lambda x, y: (1 - y, 1 - x),
-    8: lambda x, y: (y, 1 - x),
-}
+# EXIF orientations in which the upright image is flipped left to right, and top to bottom. Before
+# that, 5 to 8 exchange x and y.
+FLIPPED = (2, 3, 6, 7), (3, 4, 7, 8)
 
 
 @dataclass(frozen=True)
@@ -81,11 +74,6 @@ class Annotated:
     labels: Int[np.ndarray, " M"]
     is_crowd: Bool[np.ndarray, " M"]
     is_stored: bool = False
-
-    @property
-    def source(self) -> str:
-        """Folder of the photograph in its name. Empty without one."""
-        return self.name.rpartition("/")[0]
 
 
 @dataclass(frozen=True)
@@ -143,18 +131,14 @@ def read_masks(folder: Path) -> tuple[list[Annotated], dict[str, Path], list[str
             break
     else:
         raise InputError(f"photos={folder} lacks images/ or masks/: move them there", "photos")
-    marked, paths, missing = [], {}, []
-    for item in find_unlabeled(images):
-        name = str(item.path)
-        mask = (masks / item.path).with_suffix(".png")
-        if mask.is_file():
-            marked.append(_annotated(images / item.path, name, None, []))
-            paths[name] = mask
-        else:
-            missing.append(name)
-    if not marked:
+    shown = [str(item.path) for item in find_unlabeled(images)]
+    all_paths = {name: (masks / name).with_suffix(".png") for name in shown}
+    paths = {name: path for name, path in all_paths.items() if path.is_file()}
+    missing = [name for name in shown if name not in paths]
+    if not paths:
         first = Path(missing[0]).with_suffix(".png")
         raise InputError(f"{masks} has no mask {first}: add it", "photos")
+    marked = [_annotated(images / name, name, None, []) for name in paths]
     return marked, paths, missing
 
 
@@ -294,15 +278,13 @@ def _find_images(file: Path, names: Sequence[str]) -> dict[str, Path]:
     uses = Counter(PurePosixPath(name).name for name in names)
     for name in [name for name in names if name not in paths]:
         parts = PurePosixPath(name).parts
-        # Images of this name, by the number of equal parts at the end of their paths.
-        by_equal_parts: dict[int, list[Path]] = defaultdict(list)
-        for image in others[parts[-1]]:
-            by_equal_parts[_equal_ends(image.parts, parts)].append(image)
-        most = max(by_equal_parts, default=0)
+        # Number of equal parts at the end of the path of each image of this name.
+        equal_parts = {image: _equal_ends(image.parts, parts) for image in others[parts[-1]]}
+        most = max(equal_parts.values(), default=0)
         # An image in another folder may be any of several that have its name.
         if most == 1 and uses[parts[-1]] > 1:
             continue
-        found = by_equal_parts[most]
+        found = [image for image in equal_parts if equal_parts[image] == most]
         if len(found) > 1:
             listed = " and ".join(map(str, found[:2]))
             raise InputError(f"{file} names the image {name}, which may be {listed}")
@@ -374,12 +356,11 @@ def _labels_without_image(photographs: Sequence[Annotated], labels: Sequence[Pat
 
 def _label_files(path: Path) -> list[Path]:
     """Return the paths at which the label file of an image may be."""
-    parts = [*path.absolute().parts]
     beside = path.with_suffix(".txt")
     files = [beside, path.parent / "labels" / beside.name]
-    if "images" in parts:
-        place = len(parts) - 1 - parts[::-1].index("images")
-        files.insert(0, Path(*parts[:place], "labels", *parts[place + 1 :]).with_suffix(".txt"))
+    above, images, below = beside.absolute().as_posix().rpartition("/images/")
+    if images:
+        files.insert(0, Path(f"{above}/labels/{below}"))
     # Accents in names may have another form of Unicode, since archives of a Mac change them.
     forms = [file.with_name(normalize(form, file.name)) for file in files for form in FORMS]
     return [*files, *forms]
@@ -409,19 +390,12 @@ def _validation_images(file: Path, content: Mapping[str, Any]) -> list[Path]:
         if path is None:
             console.warning("%s: its entry val names %s, which does not exist", file, place)
         elif path.is_file():
-            found += [path.parent / line for line in _lines(path)]
+            found += [path.parent / line for line in filter(None, read_lines(path))]
         else:
             found += [path / item.path for item in find_unlabeled(path)]
     if given and not any(map(Path.is_file, found)):
         raise InputError(f"{file} has no image of its entry val: {given}", "photos")
     return [*dict.fromkeys(found)]
-
-
-def _lines(file: Path) -> list[str]:
-    """Read the lines of a text file that are not empty."""
-    with explained(f"{file} is no text in UTF-8", "save it as UTF-8"):
-        lines = file.read_text(encoding="utf-8-sig").splitlines()
-    return [line.strip() for line in lines if line.strip()]
 
 
 def _yolo_classes(folder: Path, given: Path | None) -> tuple[tuple[str, ...], Path]:
@@ -446,16 +420,14 @@ def _yolo_classes(folder: Path, given: Path | None) -> tuple[tuple[str, ...], Pa
                 return tuple(known.get(i, str(i)) for i in range(max(known) + 1)), file
         for name in (*CLASS_FILES, *(f"labels/{name}" for name in CLASS_FILES)):
             if (parent / name).is_file():
-                return tuple(_lines(parent / name)), parent / name
+                return tuple(filter(None, read_lines(parent / name))), parent / name
     raise InputError(f"photos={folder} names no classes: add data.yaml or classes.txt", "photos")
 
 
 def _yolo_rows(file: Path, class_count: int, has_keypoints: bool) -> Iterator[Sequence[float]]:
     """Yield the row of each line of a label file, as `_annotated` takes it."""
-    with explained(f"{file} is no text", "write it again"):
-        lines = file.read_text(encoding="utf-8-sig").splitlines()
-    for number, line in enumerate(lines, 1):
-        if not line.strip():
+    for number, line in enumerate(read_lines(file), 1):
+        if not line:
             continue
         with explained(f"line {number} of {file} is no box", "write class x y width height"):
             label, *values = map(float, line.split()[: 5 if has_keypoints else None])
@@ -516,8 +488,9 @@ def _upright_boxes(photograph: Annotated, upright: Float[np.ndarray, "2"]) -> np
         if not is_upright and not (orientation > 4 and _is_similar(marked[::-1], upright)):
             fault = f"{photograph.path} has {upright[0]:g} × {upright[1]:g} pixels"
             raise InputError(f"{fault}, but its boxes are for {marked[0]:g} × {marked[1]:g}")
-        turn = TURNED.get(orientation, lambda x, y: (x, y))
-        corners = np.stack(turn(corners[..., 0], corners[..., 1]), axis=-1)
+        corners = corners[..., ::-1] if orientation in range(5, 9) else corners
+        is_flipped = [orientation in flipped for flipped in FLIPPED]
+        corners = np.where(is_flipped, 1 - corners, corners)
     # A turn exchanges corners, so the sides are the smaller and larger coordinates.
     corners = np.concatenate([corners.min(1), corners.max(1)], axis=-1)
     return corners * np.tile(upright, 2)

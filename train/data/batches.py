@@ -27,21 +27,6 @@ SMALL_IMAGE_SHIFT = 4
 Batch = tuple[Tensor, Tensor, Tensor]
 
 
-class TrainingImages(NamedTuple):
-    """Images of a data set and renders, from which training batches are made.
-
-    They are numbered together: the N training images of the data set have the
-    numbers 0 to N - 1, and the renders have the numbers from N on.
-
-    Attributes:
-        split: Images of the data set that are trained on.
-        renders: Renders with their labels.
-    """
-
-    split: Split
-    renders: Split
-
-
 class Round(NamedTuple):
     """Part of an epoch that is trained on the same renders.
 
@@ -79,16 +64,16 @@ def rounds_of_epoch(
     size = round_size(image_count, *limits)
     # The sizes of the parts differ by at most one.
     parts = shown_images.tensor_split(math.ceil(len(shown_images) / size))
-    rounds = []
-    for index, part in enumerate(parts):
-        # Numbers of the images and renders of a round, in ascending order.
-        rows = torch.cat([part.sort().values, render_numbers])
-        rounds.append(Round(epoch * len(parts) + index, epoch, rows))
-    return rounds
+    # Numbers of the images and renders of a round are in ascending order.
+    return [
+        Round(epoch * len(parts) + index, epoch, torch.cat([part.sort().values, render_numbers]))
+        for index, part in enumerate(parts)
+    ]
 
 
 def training_batches(
-    images: TrainingImages,
+    split: Split,
+    renders: Split,
     batch_size: int,
     seed: int,
     this_round: Round,
@@ -97,17 +82,17 @@ def training_batches(
 ) -> Iterator[Batch]:
     """Yield this process's images of each batch of a round, from the batch `first` on.
 
+    `split` has the images of the data set that are trained on, and `renders` the renders.
     Each of P processes gets `batch_size` / P images of each batch. All batches
     have the same size: the last batch is filled up with the first images of the
     round. All random draws are made on the CPU, so they are the same for every
     device and every number of processes. Yield images, labels, and whether each image is a render.
     """
-    split, renders = images
     own_size = batch_size // distributed.world_size()
     begin = distributed.rank() * own_size
     # The batches from `first` on, and in each the places of this process.
     own = (..., slice(first, None), slice(begin, begin + own_size))
-    drawn = _draw(images, batch_size, seed, this_round, flips)
+    drawn = _draw(split, renders, batch_size, seed, this_round, flips)
     order, shifts, is_flipped, seeds = (draws[own] for draws in drawn)
     is_render = order >= len(split)
     # `clamp` gives each render some valid row of the data set. It is replaced by the render below.
@@ -147,7 +132,7 @@ def training_batches(
 
 
 def _draw(
-    images: TrainingImages, batch_size: int, seed: int, this_round: Round, flips: str
+    split: Split, renders: Split, batch_size: int, seed: int, this_round: Round, flips: str
 ) -> tuple[Int[Tensor, "N B"], Int[Tensor, "2 N B"], Bool[Tensor, "N B"], Int[Tensor, "N B"]]:
     """Draw the N batches of B images of a round at random.
 
@@ -163,7 +148,7 @@ def _draw(
     places = torch.arange(batch_count * batch_size) % shown_count
     order = this_round.rows[permutation][places].view(batch_count, batch_size)
 
-    max_shift = max(SMALL_IMAGE_SHIFT, images.split.images.shape[-1] // 16)
+    max_shift = max(SMALL_IMAGE_SHIFT, split.images.shape[-1] // 16)
     draws = generator(seed, this_round.number, "shifts")
     shifts = torch.randint(-max_shift, max_shift + 1, (2, *order.shape), generator=draws)
     if flips == "random":
@@ -171,7 +156,7 @@ def _draw(
         is_flipped = torch.randint(0, 2, order.shape, generator=draws, dtype=torch.bool)
     else:
         # A random half of the images is flipped in even epochs, and the others in odd epochs.
-        count = len(images.split) + len(images.renders)
+        count = len(split) + len(renders)
         draws = generator(seed, "flips")
         is_flipped_if_even = torch.randint(0, 2, (count,), generator=draws, dtype=torch.bool)
         is_flipped = (is_flipped_if_even ^ bool(this_round.epoch % 2))[order]

@@ -234,8 +234,7 @@ class WebDataset(DataSet):
             tar.addfile(info, io.BytesIO(data))
 
 
-KINDS = (ImageFolder, Coco, Yolo, WebDataset)
-FORMATS: dict[str, type[DataSet]] = {kind.__name__.lower(): kind for kind in KINDS}
+FORMATS = {"imagefolder": ImageFolder, "coco": Coco, "yolo": Yolo, "webdataset": WebDataset}
 
 
 def first_label(render: LabeledRender) -> str:

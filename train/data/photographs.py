@@ -95,12 +95,6 @@ def find_photographs(folder: Path, classes: Sequence[str], label: Label) -> list
     return photographs
 
 
-def class_folders(folder: Path, classes: Sequence[str]) -> list[str]:
-    """List the classes for which a folder has a subfolder."""
-    names = {*folder_names(folder)}
-    return sorted(name for name in classes if composed(name) in names)
-
-
 def choose_labels(
     folder: Path, classes: Sequence[str], label: str | int | Sequence[str | int] | None
 ) -> list[str]:
@@ -113,10 +107,8 @@ def choose_labels(
     shown = {composed(path.parts[0]) for path in _image_files(folder)[0]}
     labels = sorted(name for name in classes if composed(name) in shown)
     if not labels:
-        fault = (
-            f"photos={folder} has no sub-folder of images named by a class, such as {classes[0]}"
-        )
-        raise InputError(f"{fault}: rename them, or give classes or label")
+        fault = f"photos={folder} has no sub-folder of images named by a class"
+        raise InputError(f"{fault}, such as {classes[0]}: rename them, or give classes or label")
     if len(labels) > MAX_LABELS:
         fault = f"photos={folder} has {len(labels)} classes, more than {MAX_LABELS}"
         raise InputError(f"{fault}: choose the positive classes with label", "label")

@@ -142,11 +142,9 @@ def _render_solid(name: str, settings: ImageSettings, draws: Generator) -> UInt8
         for polar, azimuth, width in numbers
     ]
     grays = torch.rand(BACKGROUNDS, generator=draws).tolist()
-    lights = []
-    for camera in cameras:
-        to_camera = torch.tensor(camera.axes()[2], dtype=torch.float32)
-        # Each pair of camera and background has a light of its own, from the side of the camera.
-        lights += [soft_front_light(to_camera, draws) for _ in grays]
+    sides = [torch.tensor(camera.axes()[2], dtype=torch.float32) for camera in cameras]
+    # Each pair of camera and background has a light of its own, from the side of the camera.
+    lights = [soft_front_light(to_camera, draws) for to_camera in sides for _ in grays]
     shown = ([SceneObject("", normalize(mesh))], cameras, load_backgrounds(grays, settings.size))
     scene = Scene.grid(*shown, torch.stack(lights), settings, choose("numpy"))
     examples = torch.arange(len(scene))

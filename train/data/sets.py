@@ -331,9 +331,8 @@ def relabeled(data: DataSet, classes: Sequence[str], subject: str) -> DataSet:
     """Replace the labels of a data set by the class indices of a network."""
     # The new label of each old label.
     new_labels = torch.tensor([class_index(classes, name, subject) for name in data.classes])
-    train = Split(data.train.images, new_labels[data.train.labels])
-    test = Split(data.test.images, new_labels[data.test.labels])
-    return replace(data, classes=tuple(classes), train=train, test=test)
+    splits = [Split(split.images, new_labels[split.labels]) for split in (data.train, data.test)]
+    return replace(data, classes=tuple(classes), train=splits[0], test=splits[1])
 
 
 def held_out_rows(split: Split, fraction: float, argument: str = "fraction") -> Bool[Tensor, " N"]:

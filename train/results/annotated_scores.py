@@ -215,7 +215,7 @@ def evaluate_detector(
         # Classes that are not scored have a label that no detection has.
         true = np.array([label_of_class.get(name, -1) for name in names], int)
         pair = Found(boxes, own, scores), Marked(fitted.boxes, true, item.is_crowd[fitted.is_kept])
-        sources.setdefault(item.source or ".", []).append(len(matches))
+        sources.setdefault(item.name.rpartition("/")[0] or ".", []).append(len(matches))
         matches.append([detections.match_image(*pair, iou) for iou in (task.iou, 0.5)])
         for box, label, score in zip(boxes, own, scores, strict=True):
             left, top, right, bottom = box.round(2).tolist()

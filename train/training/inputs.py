@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from augment import distributed
 from augment.classifier import TaskNetwork
 from augment.exposure import light_settings, without_normalized_light
-from augment.files import as_facts, is_network_file, name_from_anywhere, require_no_facts
+from augment.files import NetworkFacts, is_network_file, name_from_anywhere, require_no_facts
 from augment.network import FROM_FILE, YOU, Inputs
 from augment.progress import Phases
 from augment.scene.build import build_scene
@@ -130,7 +130,7 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
     if settings.weights is not None:
         raise InputError(f"weights: network={name} has its own: leave weights out", "weights")
     # The network of a run has its own classes and its own normalization.
-    stated_facts = as_facts(settings.classes, None, settings.normalization, settings.prompt)
+    stated_facts = NetworkFacts(settings.classes, None, settings.normalization, settings.prompt)
     require_no_facts(f"network={name}", stated_facts)
     with keyed(run="network"):
         path, state = checkpoints.load_selected(source)
@@ -176,7 +176,7 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
         # A file may not record the size of its images, so it gets the size of the settings.
         # Any other classifier has a size of its own.
         given_size = size if is_network_file(name) else None
-        facts = as_facts(settings.classes, given_size, settings.normalization, settings.prompt)
+        facts = NetworkFacts(settings.classes, given_size, settings.normalization, settings.prompt)
         weights = None if settings.weights is None else as_path("weights", settings.weights)
         classifier = load_source(name, weights, facts, settings.trust)
     if not isinstance(classifier.task, Classification):

@@ -29,14 +29,7 @@ from augment.tasks.detection import Detection
 from renderer.errors import InputError, explained, keyed, require_memory
 from renderer.image import to_bytes, to_unit
 from train import checkpoints, console, run_folder
-from train.data.batches import (
-    Batch,
-    Round,
-    TrainingImages,
-    round_size,
-    rounds_of_epoch,
-    training_batches,
-)
+from train.data.batches import Batch, Round, round_size, rounds_of_epoch, training_batches
 from train.data.sets import Split
 from train.device import MixedPrecision, SignalHandler, all_reduce_sum, compiles, wrap_ddp
 from train.settings import TrainSettings
@@ -303,7 +296,7 @@ class Trainer:
                 has_losses = self.is_detector and getattr(self.service.task, "decode", None) is None
                 recipe.set_training_mode(self.model, settings, has_losses)
                 options = settings.batch_size, self.seed, now, settings.flips, first
-                batches = training_batches(TrainingImages(split, shown), *options)
+                batches = training_batches(split, shown, *options)
                 for batch in progress(batches, title, steps[index], first):
                     # Fraction of the training that is done, on which the learning rate depends.
                     done = state.step / sum(steps)

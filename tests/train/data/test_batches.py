@@ -21,10 +21,10 @@ def epoch_round(image_count: int, epoch: int) -> batches.Round:
     return batches.Round(epoch, epoch, torch.arange(image_count))
 
 
-def numbered(images: torch.Tensor) -> batches.TrainingImages:
+def numbered(images: torch.Tensor) -> tuple[Split, Split]:
     """Make training images without renders, each labeled with its row."""
     split = Split(images, torch.arange(len(images)))
-    return batches.TrainingImages(split, split[:0])
+    return split, split[:0]
 
 
 @pytest.mark.parametrize("shape", [(5, 5), (6, 11)])
@@ -64,7 +64,7 @@ def test_shifts_and_flips_are_all_drawn_about_equally_often(size, largest_shift,
 
     middle = size // 2
     centers = []
-    for images, *_ in batches.training_batches(data, 300, 0, epoch_round(count, 0)):
+    for images, *_ in batches.training_batches(*data, 300, 0, epoch_round(count, 0)):
         centers.append(images[:, :2, middle, middle - 1 : middle + 2].long())
     center = torch.cat(centers)  # (count, 2, 3): the middle pixel and its two neighbors
 
@@ -81,9 +81,7 @@ def mirrored_rows(images: torch.Tensor | ImageFiles, now: batches.Round) -> torc
     """Return for each of 40 images, which grow brighter to the right, whether it is mirrored."""
     split = Split(images, torch.arange(40))
     no_renders = Split(images[:0], split.labels[:0])
-    shown = batches.training_batches(
-        batches.TrainingImages(split, no_renders), 40, 0, now, "alternating"
-    )
+    shown = batches.training_batches(split, no_renders, 40, 0, now, "alternating")
     ((images, labels, _),) = shown
     is_flipped = images[:, 0, 5, 4] > images[:, 0, 5, 6]
     return is_flipped[labels.argsort()]
@@ -103,7 +101,7 @@ def test_alternating_flips_show_each_image_mirrored_in_every_other_epoch(is_on_d
 
 def test_an_epoch_shows_every_image_once_and_fills_the_last_batch_with_the_first_images():
     images = numbered(noise(100, 3, 8, 8))
-    shown = batches.training_batches(images, 7, 0, epoch_round(100, 0))
+    shown = batches.training_batches(*images, 7, 0, epoch_round(100, 0))
     labels = [labels for _, labels, _ in shown]
     assert [len(batch) for batch in labels] == [7] * 15
     order = torch.cat(labels).tolist()
@@ -119,13 +117,13 @@ def test_an_epoch_continues_from_any_batch_as_if_one_split_held_its_part_and_ren
     part = split.part(torch.arange(90) % 2 == 0)
     # Images in memory are not copied.
     assert part.images is split.images
-    separate = batches.TrainingImages(part, renders)
+    separate = part, renders
     mixed = numbered(torch.cat([split.images[rows], renders.images]))
     mixed_labels = torch.cat([rows, renders.labels])
-    whole = list(batches.training_batches(mixed, 8, 0, epoch_round(50, 1), flips))
+    whole = list(batches.training_batches(*mixed, 8, 0, epoch_round(50, 1), flips))
 
     for first in range(len(whole) + 1):
-        continued = batches.training_batches(separate, 8, 0, epoch_round(50, 1), flips, first)
+        continued = batches.training_batches(*separate, 8, 0, epoch_round(50, 1), flips, first)
         for batch, expected in zip(continued, whole[first:], strict=True):
             images, labels, is_render = batch
             expected_images, mixed_rows, _ = expected
@@ -170,11 +168,11 @@ def test_objects_in_renders_move_with_the_pixels_that_show_them():
     renders = (masks * light).sum(1, dtype=torch.uint8)[:, None].repeat(1, 3, 1, 1)
     renders[:, 1] = torch.arange(3, dtype=torch.uint8)[:, None, None]  # Green is the index.
     photographs = Split(noise(4, 3, 12, 16), torch.zeros(4, dtype=torch.int64))
-    images = batches.TrainingImages(photographs, Split(renders, object_maps(targets)))
+    images = photographs, Split(renders, object_maps(targets))
     counts = []
     for number in range(20):
         now = batches.Round(number, number, torch.arange(7))
-        for batch, maps, is_render in batches.training_batches(images, 7, 3, now):
+        for batch, maps, is_render in batches.training_batches(*images, 7, 3, now):
             assert (maps[~is_render] == NO_OBJECT).all()
             for image, objects in zip(batch[is_render], maps[is_render], strict=True):
                 red, index = image[0], int(image[1, 0, 0])
@@ -193,8 +191,7 @@ def test_a_batch_of_renders_alone_needs_no_file(tmp_path):
     files = ImageFiles(tmp_path, (PurePosixPath("photograph.png"),), 12, workers=0, skip=False)
     photographs = Split(files, torch.zeros(1, dtype=torch.int64))
     renders = Split(noise(3, 3, 12, 12), torch.ones(3, dtype=torch.int64))
-    images = batches.TrainingImages(photographs, renders)
-    made = [*batches.training_batches(images, 2, 0, epoch_round(4, 0))]
+    made = [*batches.training_batches(photographs, renders, 2, 0, epoch_round(4, 0))]
     assert sorted(int(is_render.sum()) for _, _, is_render in made) == [1, 2]
     for shown, labels, is_render in made:
         assert labels.tolist() == is_render.int().tolist()

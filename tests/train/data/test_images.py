@@ -9,7 +9,7 @@ from PIL import Image
 
 from renderer.errors import InputError
 from tests.helpers import save_plain
-from train.data.batches import Round, TrainingImages, training_batches
+from train.data.batches import Round, training_batches
 from train.data.photographs import find_unlabeled, load_photographs
 from train.data.sets import ImageFiles, Split, load_folder, load_unlabeled
 from train.device import SignalHandler
@@ -104,15 +104,15 @@ def test_batches_from_disk_have_labeled_images_and_renders_and_go_on_where_they_
     assert isinstance(data.train.images, ImageFiles)
     assert data.size == SIZE
     renders = Split(torch.full((3, 3, SIZE, SIZE), 200, dtype=torch.uint8), torch.full((3,), -2))
-    images = TrainingImages(data.train[1:9], renders)
+    images = data.train[1:9], renders
     every = Round(number=3, epoch=3, rows=torch.arange(11))
-    batches = list(training_batches(images, 4, 0, every))
+    batches = list(training_batches(*images, 4, 0, every))
     assert len(batches) == 3
     for pixels, labels, rendered in batches:
         value = pixels[:, 0, 40, 40].long()
         assert torch.equal(labels, torch.where(rendered, -2, value // 10 - 1))
         assert torch.equal(rendered, value == 200)
-    rest = list(training_batches(images, 4, 0, every, first=1))
+    rest = list(training_batches(*images, 4, 0, every, first=1))
     for batch, expected in zip(rest, batches[1:], strict=True):
         for part, expected_part in zip(batch, expected, strict=True):
             assert torch.equal(part, expected_part)

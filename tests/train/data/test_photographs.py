@@ -116,7 +116,7 @@ def test_names_with_accents_are_equal_in_both_forms_of_unicode(tmp_path, of_clas
     assert first.label == normalize("NFC", "crème brûlée")
     assert first.source == normalize("NFC", "Zürich")
     assert (tmp_path / first.path).exists()
-    assert photographs.class_folders(tmp_path, classes) == sorted([classes[0], classes[2]])
+    assert photographs.choose_labels(tmp_path, classes, None) == sorted([classes[0], classes[2]])
     assert class_index(classes, normalize(of_others, "açaí"), "label") == 1
     mesh = normalize(of_others, "crème_brûlée.glb")
     assert classes_of_meshes([mesh], classes, "meshes") == [classes[2]]

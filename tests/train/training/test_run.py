@@ -55,8 +55,8 @@ def metrics(folder: Path) -> list[dict]:
 
 
 def act_at(monkeypatch, round_number: int, step: int, act: Callable[[], None]) -> None:
-    def acting(images, batch_size, seed, now, *options):
-        shown = batches.training_batches(images, batch_size, seed, now, *options)
+    def acting(split, renders, batch_size, seed, now, *options):
+        shown = batches.training_batches(split, renders, batch_size, seed, now, *options)
         for number, batch in enumerate(shown, 1):
             if (now.number, number) == (round_number, step):
                 act()
@@ -74,13 +74,12 @@ def train_with_signal(settings, folder: Path, round_number, step, number) -> Non
 @pytest.fixture
 def renders_of_rounds(monkeypatch) -> list[Split]:
     renders = []
-    training_images = loop.TrainingImages
 
-    def record(*fields):
-        renders.append(fields[1])
-        return training_images(*fields)
+    def recorded(split, shown, *options):
+        renders.append(shown)
+        return batches.training_batches(split, shown, *options)
 
-    monkeypatch.setattr(loop, "TrainingImages", record)
+    monkeypatch.setattr(loop, "training_batches", recorded)
     return renders
 
 
@@ -333,8 +332,8 @@ def test_a_damaged_file_is_replaced_by_a_trained_or_a_held_out_one_as_it_is_itse
         (tmp_path / "images" / f"{level:02}.png").write_bytes(b"damaged")
     shown = {True: [], False: []}  # Levels by whether they validate.
 
-    def recorded_batches(images, *options):
-        for batch in batches.training_batches(images, *options):
+    def recorded_batches(*options):
+        for batch in batches.training_batches(*options):
             shown[False] += batch[0][:, 0, 0, 0].tolist()
             yield batch
 
