@@ -129,10 +129,11 @@ def render_attacked(
 ) -> tuple[Float[torch.Tensor, "3 size size"], Float[torch.Tensor, "3 size size"]]:
     """Return the encoded background, and the render as it is before an attack by pnb-attack."""
     rendered = RendererSettings(**{"shadows": True, **renderer})
-    attacked = AttackExperimentSettings(scene=AttackSceneSettings(**scene), renderer=rendered)
+    chosen = AttackSceneSettings(**scene)
+    attacked = AttackExperimentSettings(scene=chosen, renderer=rendered, device="cpu")
     label = settings.label or ""
     mesh = ObjectSettings(settings.mesh, label=label, albedo_scale=settings.albedo_scale)
-    shown = build_attacked(attacked, mesh, attacked.scene, ATTACKED_SIZE, torch.device("cpu"))
+    shown = build_attacked(attacked, mesh, chosen, ATTACKED_SIZE)
     first_example = torch.arange(1)
     # The render has one example and one view, shape (1, 1, 3, size, size).
     return shown.backgrounds[0], shown.render(shown.conditions(first_example), first_example)[0, 0]
