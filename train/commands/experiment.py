@@ -22,10 +22,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from augment import distributed
 from renderer.errors import InputError, keyed
@@ -92,11 +92,10 @@ def _train_on_photographs(
     """
     first = folder / PHOTOGRAPHS_FIRST
     values = asdict(settings)
-    changes = {name: values[name] for name in SHARED}
-    changes["out"] = str(first)
+    changes = {name: values[name] for name in SHARED} | {"out": str(first)}
     changes["train"] = {name: values["train"][name] for name in SHARED_IN_TRAIN}
-    config = OmegaConf.merge(main.compose(["experiment=photographs"]), changes)
-    on_photographs = read_settings(ExperimentSettings, cast(DictConfig, config))
+    config = main.compose(["experiment=photographs"])
+    on_photographs = read_settings(ExperimentSettings, config, changes)
     if settings.train.resume and is_finished(first):
         require_same_run(first, on_photographs, done=True)
     else:
@@ -215,10 +214,9 @@ def sweep(
         raise InputError("photographs_first=true makes no sweep: start the runs one by one")
     if first_config.compare:
         raise InputError(f"compare={first_config.compare} makes no sweep: give augment=none,random")
-    overwrite = bool(first_config.overwrite)
     parent = writable_folder(str(first_config.sweep), "sweep")
     # An earlier report about the same sweep may be replaced.
-    require_replaceable(parent, "sweep", overwrite, own=[PAGE])
+    require_replaceable(parent, "sweep", first_config.overwrite, own=[PAGE])
     shared = set.intersection(*map(set, runs))
     shared_keys = [override.partition("=")[0] for override in shared]
     folders = [parent / run_name(overrides, shared_keys, str(parent)) for overrides in runs]
@@ -231,7 +229,7 @@ def sweep(
         if is_finished(folder) or checkpoints.exists(folder):
             require_same_run(folder, settings, done=True)
         else:
-            require_new_run(folder, "sweep", overwrite, resume=True)
+            require_new_run(folder, "sweep", settings.overwrite, resume=True)
             texts = [word for word in overrides if not re.search(r"=[-+.e\d]+$", word)]
             new_runs.setdefault(frozenset(texts), (folder, settings))
     # Numbers are checked now. The files and networks that texts name are checked by loading them.

@@ -3,12 +3,11 @@
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from copy import deepcopy
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
 import torch
-from omegaconf import OmegaConf
 from torch import Tensor, nn
 
 from augment.augmentation_settings import AugmentationSettings
@@ -244,14 +243,12 @@ def _read_settings(
     `sections`, which the caller gave, win over `changes`, and these win over the experiment.
     """
     config = main.compose([f"experiment={experiment}"])
-    # The configuration without keys that belong to the command alone.
-    settings = OmegaConf.masked_copy(config, [item.name for item in fields(ExperimentSettings)])
     # `harden` returns only the network, so scores on test renders are not needed.
-    settings.evaluate.laboratory_setups = 0
+    config.evaluate.laboratory_setups = 0
     given = {}
     for name, section in sections.items():
         values = asdict(cast(Any, section)) if isinstance(section, Settings) else section or {}
         if not isinstance(values, Mapping):
             raise InputError(f"{name} is {describe(section)}: give a mapping, or settings")
         given[name] = values
-    return read_settings(ExperimentSettings, settings, changes, given)
+    return read_settings(ExperimentSettings, config, changes, given)
