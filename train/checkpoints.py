@@ -20,7 +20,7 @@ from zipfile import ZipFile
 import safetensors.torch
 import torch
 from safetensors import safe_open
-from torch import Tensor, cuda
+from torch import Tensor
 
 from augment.classifier import Classifier, OperatingPoint, TaskNetwork
 from augment.exposure import DIM, with_normalized_light
@@ -108,22 +108,6 @@ def load_newest(folder: Path) -> tuple[dict[str, Any], str | None]:
         if not (folder / PREVIOUS).is_file():
             raise
         return load(folder / PREVIOUS), str(error)
-
-
-def random_state() -> dict[str, Tensor | list[Tensor]]:
-    """Return the states of the random generators of torch. "cuda" has one state for each GPU."""
-    states = cuda.get_rng_state_all() if cuda.is_available() else []
-    return {"cpu": torch.get_rng_state(), "cuda": states}
-
-
-def restore_random_state(state: Mapping[str, Any]) -> None:
-    """Set the random generators of torch to states that `random_state` returned.
-
-    Surplus states or GPUs are ignored.
-    """
-    torch.set_rng_state(state["cpu"])
-    for device, values in zip(range(cuda.device_count()), state["cuda"], strict=False):
-        cuda.set_rng_state(values, device)
 
 
 def load_network(
@@ -280,9 +264,6 @@ def load_run(
             loaded = Classifier(*facts)
             points = state.get("operating_point", [])
             loaded.operating_points = [OperatingPoint(**values) for values in points]
-            for point in loaded.operating_points:
-                # This call raises InputError if the network lacks the class.
-                loaded.label(point.label)
         loaded.inputs = stated_inputs(state["architecture"])
         if RECOGNIZER in state:
             loaded.recognizer = Recognizer(network, **state[RECOGNIZER])

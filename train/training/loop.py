@@ -17,7 +17,7 @@ from typing import Any, cast
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor, cuda, nn
 
 from augment import distributed
 from augment.network import compute_outputs, device_of, eval_mode
@@ -118,7 +118,6 @@ class TrainingStep:
             is_compiled = compiles(settings.compile, device)
         self._loss: Callable[..., tuple[Tensor, Tensor]]
         if isinstance(service.task, Detection):
-            is_compiled = False
             self._loss = DetectionLoss(replica, settings, teacher, service.task).compute
         else:
             if settings.augmentation == "pgd" and not self.labeled:
@@ -130,11 +129,11 @@ class TrainingStep:
                 # The teacher takes the features from the network in training, if they are equal.
                 loss.teacher = recipe.share_layers(settings, model, teacher, self.size)
             self._loss = loss.compute
-        if is_compiled:
-            # torch limits the number of compiled functions in a process. Those of an
-            # earlier run are removed.
-            torch.compiler.reset()
-            self._loss = torch.compile(self._loss, mode="reduce-overhead", dynamic=False)
+            if is_compiled:
+                # torch limits the number of compiled functions in a process. Those of an
+                # earlier run are removed.
+                torch.compiler.reset()
+                self._loss = torch.compile(self._loss, mode="reduce-overhead", dynamic=False)
 
     def take(self, batch: Batch, done: float, number: int) -> Float[Tensor, " 2"]:
         """Change the weights by the gradient of the loss of a batch.
@@ -262,7 +261,7 @@ class Trainer:
                 is_stopping = signals.requested()
                 is_last = self.epoch == self.settings.epochs
                 is_due = self.epoch % self.settings.checkpoint_every == 0
-                if is_stopping or is_last or (is_due and self._epoch_state is None):
+                if is_stopping or is_last or is_due:
                     self._save()
                 if is_stopping:
                     signals.stop()
@@ -280,7 +279,9 @@ class Trainer:
         steps = [math.ceil(len(one.rows) / settings.batch_size) for one in rounds]
         if self._epoch_state:
             # A resumed run continues within an epoch, with the random numbers of the first attempt.
-            checkpoints.restore_random_state(self._random_state)
+            torch.set_rng_state(self._random_state["cpu"])
+            # Surplus states or GPUs are ignored.
+            cuda.set_rng_state_all(self._random_state["cuda"][: cuda.device_count()])
         else:
             self.averages.begin_epoch(self.initial, self.step.optimizer)
             renders = self._regenerate(rounds[0])
@@ -424,6 +425,7 @@ class Trainer:
 
         "under_way" is the epoch that has begun, or None between two epochs.
         """
+        states_of_gpus = cuda.get_rng_state_all() if cuda.is_available() else []
         return {
             **self._description(),
             "model": self.model.network.state_dict(),
@@ -431,7 +433,7 @@ class Trainer:
             **self.averages.state_dict(),
             "precision": self.model.precision,
             "service": self.service.state_dict(),
-            "random_state": checkpoints.random_state(),
+            "random_state": {"cpu": torch.get_rng_state(), "cuda": states_of_gpus},
             "under_way": self._epoch_state.state_dict() if self._epoch_state else None,
             "history": self.history,
         }

@@ -243,8 +243,7 @@ class TrainingLoss:
     def learns_unchanged(self) -> bool:
         """Whether the network learns from images before the augmentation, too."""
         # Without labels, renders and distillation, only the augmented photographs are learned.
-        weight = self.settings.distillation_weight
-        return bool(self.labeled or self.positive_classes or weight)
+        return bool(self.labeled or self.positive_classes or self.settings.distillation_weight)
 
     def compute(
         self,
