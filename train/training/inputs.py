@@ -101,13 +101,12 @@ class Initial:
 
         Networks that differ in classes, image size or architecture raise InputError.
         """
-        for key in ("classes", "size"):
-            if self.architecture[key] != description[key]:
-                fault = f"network={self.source} has another {key}"
-                if key == "size":
-                    own, of_data = self.architecture[key], description[key]
-                    fault = f"network={self.source} takes {own} pixels, but the data has {of_data}"
-                raise InputError(f"{fault}: give the same {key}")
+        if self.architecture["classes"] != description["classes"]:
+            raise InputError(f"network={self.source} has other classes: give the same classes")
+        own, of_data = self.architecture["size"], description["size"]
+        if own != of_data:
+            fault = f"network={self.source} takes {own} pixels, but the data has {of_data}"
+            raise InputError(f"{fault}: give the same size")
         with checkpoints.checks_architecture(self.source):
             network.load_state_dict(self.weights)
 
@@ -162,7 +161,13 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
             console.warning("label=%s is the class of %s", names[0], ", ".join(others))
     # A number can be the index of a class.
     may_have_index = any(name.isdecimal() for name in names)
-    if not (may_have_index or settings.label_follows_from_meshes):
+    # Without a label, the run must train on objects of the positive classes, or score images of
+    # them: the list of the classes of the meshes is the label then.
+    is_scored = bool(settings.photos) or settings.evaluate.laboratory_setups > 0
+    is_used = settings.augment.renders or settings.train.ranking_weight > 0 or is_scored
+    has_meshes = bool(settings.meshes) and settings.augment.mode != "folder"
+    follows_from_meshes = settings.label is None and has_meshes and is_used
+    if not (may_have_index or follows_from_meshes):
         return settings
     initial = load_initial(settings)
     # Without an initial network, `Run` checks the label when it knows the classes of the data.
@@ -172,7 +177,7 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
 def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
     """Load a classifier, from another library or from a file, as the initial network."""
     size = settings.size
-    with keyed(name="network", size="size"):
+    with keyed(name="network"):
         # A file may not record the size of its images, so it gets the size of the settings.
         # Any other classifier has a size of its own.
         given_size = size if is_network_file(name) else None
@@ -230,11 +235,9 @@ def choose_validation(
     # was trained on rendered images records the entry "data".
     record = {"fraction": asked or default, "seed": 0, "images": data.train.content_hash}
     record |= {"data": "shapes"} if data.rendered else {}
-    stored = initial.architecture.get("validation") if initial else None
-    earlier = stored if isinstance(stored, dict) else {}
-    left_out: Any = earlier.get("fraction")
-    is_of_other_kind = data.rendered and left_out is not None and "data" not in earlier
-    if initial is None or is_of_other_kind:
+    earlier: Any = (initial.architecture.get("validation") if initial else None) or {}
+    left_out = earlier.get("fraction")
+    if initial is None or (data.rendered and earlier and "data" not in earlier):
         return asked or default, record
     # The records of the same images differ only in the fraction.
     is_known = isinstance(left_out, float) and record | {"fraction": left_out} == earlier
@@ -345,9 +348,7 @@ def build_service(
     # The ranking loss compares images of a positive class with images of other classes. It
     # needs both.
     is_ranked = is_classifier and (bool(settings.hard_negatives) or len(names) > 1)
-    positive_classes: list[int] = []
-    if is_ranked or settings.augment.renders:
-        positive_classes = [class_index(data.classes, name, "label") for name in names]
+    positive_classes = [class_index(data.classes, name, "label") for name in names]
     if settings.augment.renders and settings.augment.mode == "folder":
         images, labels = load_renders(settings, data, positive_classes)
         images = images.to(device)
