@@ -33,10 +33,11 @@ def class_name(classes: Sequence[str], label: str | int, key: str) -> str:
 def with_class_name(item: Any, classes: Sequence[str], key: str) -> Any:
     """Return the settings of a mesh, in which its class is given by name instead of by index.
 
-    The same holds for the objects beside it. A mapping without a label, or with one that no network
-    has, such as "other_lemon", keeps it. Only a mapping can have a label.
+    The same holds for the objects beside it, and for a list of meshes. A mapping without a label,
+    or with one that no network has, such as "other_lemon", keeps it. Only a mapping can have a
+    label.
     """
-    if isinstance(item, list):
+    if isinstance(item, list | tuple):
         return [with_class_name(one, classes, key) for one in item]
     if not isinstance(item, dict):
         return item
@@ -44,7 +45,7 @@ def with_class_name(item: Any, classes: Sequence[str], key: str) -> Any:
     if not is_of_no_class(item.get("label")):
         named["label"] = class_name(classes, item["label"], f"{key}.label")
     if item.get("others"):
-        named["others"] = [with_class_name(other, classes, key) for other in item["others"]]
+        named["others"] = with_class_name(item["others"], classes, key)
     return named
 
 
@@ -146,9 +147,8 @@ def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> Ex
     else:
         names = [class_name(classes, name, "label") for name in label_names(settings.label)]
         meshes = settings.meshes
-    meshes = [with_class_name(item, classes, "meshes") for item in meshes]
-    key = "hard_negatives"
-    negatives = [with_class_name(item, classes, key) for item in settings.hard_negatives]
+    meshes = with_class_name(meshes, classes, "meshes")
+    negatives = with_class_name(settings.hard_negatives, classes, "hard_negatives")
     # A single positive class is given by its name, several are given as a list.
     label = names[0] if len(names) == 1 else names
     return replace(settings, label=label, meshes=meshes, hard_negatives=negatives)
@@ -165,8 +165,7 @@ def as_mappings(name: str, items: Sequence[MeshItem]) -> list[dict[str, Any]]:
         key = f"{name}[{index}]"
         # A list of objects is one mesh with others around it, which are in the same render.
         if isinstance(item, list) and any(isinstance(of, tuple | ObjectSettings) for of in item):
-            mapping, *others = as_mappings(key, item)
-            mappings.append(mapping | {"others": [*mapping.get("others", ()), *others]})
+            mappings.append(common.as_mapping(as_mappings(key, item)))
             continue
         if isinstance(item, ObjectSettings):
             mapping = asdict(item)
