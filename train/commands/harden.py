@@ -169,9 +169,7 @@ def harden(
         changes: dict[str, Any] = {"seed": seed, "overwrite": overwrite, "meshes": items}
         changes |= {"network": classifier.name, "unlabeled": str(as_path("unlabeled", unlabeled))}
         changes |= {"data": {"name": "unlabeled"}, "train": {"device": str(device)}}
-        changes["out"] = str(folder.absolute())
-        if label is not None:
-            changes["label"] = label
+        changes |= {"out": str(folder.absolute()), "label": label}
         if is_detector:
             require_losses(classifier, bool(meshes))
             if not meshes:

@@ -1,4 +1,4 @@
-"""Averages of the weights of a network over the training, and the choice of the best network."""
+"""Averages of the weights of a network over the training, and interpolation between weights."""
 
 from collections.abc import Mapping
 from typing import Any, cast
@@ -61,7 +61,7 @@ class MovingAverage(AveragedModel):
 
 
 class Averages:
-    """Averages of a network in training, and the choice of the network that the training keeps.
+    """Averages of a network in training.
 
     There are two averages, and both are optional: an exponential moving average of the weights
     over the steps, and a model soup, the mean of the weights after each epoch (Wortsman et al.
@@ -72,19 +72,16 @@ class Averages:
             else the network in training.
     """
 
-    def __init__(self, model: MixedPrecision, decay: float, soup: bool, keeps_latest: bool = False):
+    def __init__(self, model: MixedPrecision, decay: float, soup: bool):
         """Create the averages, which are empty at first.
 
-        `decay` is that of a step, or 0 for no moving average. With `keeps_latest` or a
-        soup, the last network is kept instead of the one with the highest validation accuracy.
+        `decay` is that of a step, or 0 for no moving average.
         """
         self._model = model
         self._ema = MovingAverage(model, decay) if decay else None
         # The function updates the equal-weight mean of all networks so far, as for SWA.
         mean = get_swa_avg_fn()
         self._soup = AveragedModel(model, avg_fn=mean, use_buffers=True) if soup else None
-        self._keeps_latest = soup or keeps_latest
-        self._best_accuracy = -1.0
         average = self._soup or self._ema
         self.selected = cast(MixedPrecision, average.module) if average else model
 
@@ -111,12 +108,6 @@ class Averages:
         if self._soup:
             self._soup.update_parameters(self._ema.module if self._ema else self._model)
 
-    def is_kept(self, accuracy: float) -> bool:
-        """Return whether to keep the network of this epoch instead of that of an earlier epoch."""
-        is_best = accuracy > self._best_accuracy
-        self._best_accuracy = max(accuracy, self._best_accuracy)
-        return is_best or self._keeps_latest
-
     def weights(self) -> dict[str, torch.Tensor]:
         """Return a copy of the weights of the selected network on the CPU, by name."""
         state = self.selected.network.state_dict()
@@ -128,13 +119,11 @@ class Averages:
         return {name: of.state_dict() if of else None for name, of in averages.items()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore the averages, and the best accuracy so far, from a checkpoint."""
+        """Restore the averages from a checkpoint."""
         if self._ema:
             self._ema.load_state_dict(state["ema"])
         if self._soup:
             self._soup.load_state_dict(state["soup"])
-        accuracies = [line["validation/accuracy"] for line in state["history"]]
-        self._best_accuracy = max(accuracies, default=-1.0)
 
 
 def interpolate(

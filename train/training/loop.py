@@ -232,9 +232,7 @@ class Trainer:
 
         self.device = next(model.parameters()).device
         self.initial = deepcopy(model).eval().requires_grad_(False) if self.has_initial else None
-        # The validation accuracy of data without labels is the agreement with the initial
-        # network. It is highest before any training, and cannot choose an epoch.
-        self.averages = Averages(model, settings.ema_decay, settings.soup, not self.labeled)
+        self.averages = Averages(model, settings.ema_decay, settings.soup)
         self.selected = self.averages.selected
         has_teacher = settings.distillation_weight or settings.consistency_weight
         teacher = self.initial if has_teacher else None
@@ -348,9 +346,11 @@ class Trainer:
         self.epoch += 1
         self._require_finite(loss_sum + validated["loss"], self.epoch)
         accuracy = validated["accuracy"]
-        # The network of this epoch replaces the selected network if it is better, or if the
-        # settings select the last network.
-        if self.averages.is_kept(accuracy):
+        # The network of this epoch replaces the selected network if it is better. The last network
+        # of a soup is selected, and that of data without labels, whose validation accuracy is the
+        # agreement with the initial network: it is highest before any training.
+        highest = max((line["validation/accuracy"] for line in self.history), default=-1.0)
+        if accuracy > highest or self.settings.soup or not self.labeled:
             self._best_is_new = True
             self.best = {"model": self.averages.weights(), **self._description()}
             self.best["validation_accuracy"] = accuracy
@@ -530,7 +530,6 @@ def fitting_batch_size(settings: TrainSettings, model: nn.Module, in_round: int,
 def activation_bytes(model: nn.Module, size: int) -> int:
     """Measure the memory that a training step keeps for each image until its backward pass."""
     totals = []
-    device = next(model.parameters()).device
     for count in (1, 2):
         kept: dict[int, int] = {}
 
@@ -541,7 +540,7 @@ def activation_bytes(model: nn.Module, size: int) -> int:
         hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor)
         with eval_mode(model), torch.enable_grad(), hooks:
             # The result holds the kept tensors, whose addresses would otherwise be used again.
-            result = model(torch.full((count, 3, size, size), 0.5, device=device))
+            result = model(torch.full((count, 3, size, size), 0.5, device=device_of(model)))
         totals.append(sum(kept.values()))
         del result
     # The difference leaves out the weights, which all images share.
