@@ -165,9 +165,9 @@ def as_mappings(name: str, items: Sequence[MeshItem]) -> list[dict[str, Any]]:
         key = f"{name}[{index}]"
         # A list of objects is one mesh with others around it, which are in the same render.
         if isinstance(item, list) and any(isinstance(of, tuple | ObjectSettings) for of in item):
-            mappings.append(common.as_mapping(as_mappings(key, item)))
-            continue
-        if isinstance(item, ObjectSettings):
+            first, *others = as_mappings(key, item)
+            mapping = first | {"others": [*first.get("others", ()), *others]}
+        elif isinstance(item, ObjectSettings):
             mapping = asdict(item)
         else:
             # Other items are a source, or a pair of a source and a class.

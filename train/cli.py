@@ -169,17 +169,11 @@ class Command:
         """
         self.register()
         words = self.to_overrides(overrides) if as_typed else list(overrides)
-        try:
-            # While a command runs, Hydra is initialized, and must not be initialized again.
-            if GlobalHydra.instance().is_initialized():
-                return hydra.compose(self.name, words)
-            with initialize_config_module("conf", version_base="1.3"):
-                return hydra.compose(self.name, words)
-        except Exception as error:
-            sentence = explain(error, self.keys, words)
-            if sentence is None:
-                raise
-            raise InputError(sentence) from error
+        # While a command runs, Hydra is initialized, and must not be initialized again.
+        if GlobalHydra.instance().is_initialized():
+            return hydra.compose(self.name, words)
+        with initialize_config_module("conf", version_base="1.3"):
+            return hydra.compose(self.name, words)
 
     def read(self, overrides: Sequence[str] = (), as_typed: bool = True) -> Any:
         """Return the settings that the command would have with the arguments of `compose`."""
