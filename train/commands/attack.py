@@ -155,7 +155,7 @@ def _headings(attacked: Sequence[_AttackedMesh]) -> list[str]:
 def _results_of(settings: AttackExperimentSettings, classifier: Classifier) -> Iterator[Path]:
     """Yield the empty folder of the results, and write config.yaml at the end of the block."""
     out = output_folder(settings.out, settings.overwrite)
-    with sole_writer("out", out):
+    with sole_writer(out):
         remove_attack(out)
         yield out
         images = classifier.describe_inputs()

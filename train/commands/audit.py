@@ -245,7 +245,7 @@ def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page
         console.warning(sentence)
     described = [f"Images of {one.name}: {one.describe_inputs()}." for one in networks.values()]
     caveats = [*described, *caveats]
-    with sole_writer("out", out):
+    with sole_writer(out):
         _prepare_folder(settings, out, renders, networks)
         for key in networks:
             (out / key).mkdir(exist_ok=True)
@@ -421,8 +421,7 @@ class _Plan:
         to_render = self.image_folders.keys() - self.measured_folders().keys()
         later = [IN_WORDS[name] for name in to_render]
         if attacks:
-            missing = " and ".join(["attacks within smaller radii", *later])
-            yield missing, self.measured_folders()
+            yield " and ".join(["attacks within smaller radii", *later]), self.measured_folders()
         for path, counts in attacks.items():
             _write_json(path, lambda counts=counts: [*counts][-1])
             path.with_name(path.stem + lights.FIRST).unlink()

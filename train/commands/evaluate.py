@@ -165,7 +165,7 @@ def evaluate(
         280
     """
     # `calibrate` and `false_positive_rate` belong together.
-    require_calibration(false_positive_rate, None if calibrate is None else str(calibrate))
+    require_calibration(false_positive_rate, calibrate)
     require_choice("fit", fit, FITS)
     folder = published_folder(as_path("photos", photos))
     device = device_of(network) if device is None else torch.device(device)
@@ -188,7 +188,7 @@ def evaluate(
             target = output_folder(str(out), overwrite)
             if folder.is_dir():
                 require_outside(target, folder)
-        with sole_writer("out", target) if target else nullcontext():
+        with sole_writer(target) if target else nullcontext():
             if not isinstance(made, Classifier):
                 found: AnnotatedScores
                 how = Showing(fit, skip_unreadable, device)

@@ -128,7 +128,7 @@ def _train_in(folder: Path, settings: ExperimentSettings, command: str, out: Pat
     with ExitStack() as first_process:
         if distributed.rank() == 0:
             first_process.enter_context(logged_to(writable_folder(folder, "out") / LOG))
-            first_process.enter_context(sole_writer("out", *settings_of_runs))
+            first_process.enter_context(sole_writer(*settings_of_runs))
         try:
             data, initial = load_inputs(next(iter(settings_of_runs.values())))
             # All mistakes are reported before the first run is trained.

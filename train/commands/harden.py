@@ -196,7 +196,7 @@ def harden(
         if meshes or label is not None:
             settings = class_names.with_class_names(settings, classifier.classes)
         # Training changes threads, random generators and cuDNN's choices, which are restored.
-        with sole_writer("out", folder), ExitStack() as at_end, torch.random.fork_rng():
+        with sole_writer(folder), ExitStack() as at_end, torch.random.fork_rng():
             cudnn = torch.backends.cudnn
             at_end.callback(torch.set_num_threads, torch.get_num_threads())
             at_end.callback(setattr, cudnn, "benchmark", cudnn.benchmark)

@@ -35,12 +35,13 @@ def run(settings: RenderSettings) -> None:
     # An object without a label gets the given one, or else the class that its mesh is named by.
     for item in objects:
         item.label = item.label or default or name_of_mesh(item.mesh)
-    shown = [of for item in objects for of in (item, *item.others)]
-    unlabeled = [of.mesh for of in shown if not of.label]
+    labels = [of.label for item in objects for of in (item, *item.others)]
+    unlabeled = [other.mesh for item in objects for other in item.others if not other.label]
     if unlabeled:
-        line = "objects without a label are drawn, but not annotated: %s"
-        console.warning(line, ", ".join(unlabeled))
-    classes = [*dict.fromkeys(of.label for of in shown if of.label)]
+        console.warning(
+            "objects without a label are drawn, but not annotated: %s", ", ".join(unlabeled)
+        )
+    classes = [*dict.fromkeys(label for label in labels if label)]
     folder = writable_folder(settings.out, "out")
     for name in classes if settings.format == "imagefolder" else ():
         # A name such as "a/b" or ".." would be another folder.
