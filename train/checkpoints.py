@@ -125,7 +125,6 @@ def load_network(
     The arguments other than `name` are those of `nb.load_classifier`. The network of a run has
     its own weights and its own `facts`, such as classes and size, so these must then be None.
     """
-    require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     if name.startswith(SWITCHES):
         plain, other = split_switch(name)
         network = load_network(plain, weights, trust_code=trust_code, **facts)

@@ -153,7 +153,7 @@ def publish(
         >>> nb.load_run("published/best").size
         32
     """
-    require_calibration(false_positive_rate, None if calibrate is None else str(calibrate))
+    require_calibration(false_positive_rate, calibrate)
     target = writable_folder(str(as_path("out", out)), "out")
     folder = as_path("run", run)
     path, state = load_selected(folder)

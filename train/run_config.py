@@ -158,7 +158,7 @@ def require_same_run(folder: Path, settings: ExperimentSettings, done: bool = Fa
     """
 
     def is_permitted(key: str, old: Any, new: Any) -> bool:
-        is_longer = key == "train.epochs" and isinstance(old, int) and new > old
+        is_longer = key == "train.epochs" and new > old
         # A finished run may not differ at all.
         return not done and (is_longer or key.startswith(("evaluate.", "photos")))
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn, get_swa_avg_fn
 
-from augment.network import compute_outputs
+from augment.network import compute_outputs, device_of
 from augment.progress import progress
 from augment.random_streams import stream_seed
 from train import console
@@ -149,7 +149,7 @@ def interpolate(
     """
     # Weights of the losses of unchanged and of relit images.
     weights = (recipe.distillation_weight or 1.0, recipe.consistency_weight)
-    device = next(initial.parameters()).device
+    device = device_of(initial)
     initial_weights = {name: value.cpu() for name, value in initial.network.state_dict().items()}
     targets = predict(initial, validation, device)
     # The loss at each factor: 0 gives the initial weights, and 1 the trained ones.

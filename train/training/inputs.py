@@ -23,7 +23,7 @@ from augment.switch import SWITCHES
 from augment.tasks.classification import Classification, class_index, complementary_label
 from augment.tasks.detection import Detection
 from augment.tasks.task import Task
-from renderer.errors import InputError, as_path, composed, is_whole, keyed, keys_of, require_range
+from renderer.errors import InputError, composed, is_whole, keyed, keys_of, require_range
 from renderer.settings import MAX_SIZE
 from train import checkpoints, console
 from train.class_names import class_of_name, name_of_mesh, require_others, with_class_names
@@ -182,7 +182,7 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
         # Any other classifier has a size of its own.
         given_size = size if is_network_file(name) else None
         facts = as_facts(settings.classes, given_size, settings.normalization, settings.prompt)
-        weights = None if settings.weights is None else as_path("weights", settings.weights)
+        weights = Path(settings.weights) if settings.weights else None
         classifier = load_source(name, weights, facts, settings.trust)
     if not isinstance(classifier.task, Classification):
         fault = f"network={name} is no classifier, but for {classifier.task.name}"
@@ -240,7 +240,7 @@ def choose_validation(
     if initial is None or (data.rendered and earlier and "data" not in earlier):
         return asked or default, record
     # The records of the same images differ only in the fraction.
-    is_known = isinstance(left_out, float) and record | {"fraction": left_out} == earlier
+    is_known = record | {"fraction": left_out} == earlier
     fraction: float = asked or (left_out if is_known else default)
     if not is_known or fraction > left_out:
         console.debug("validation: %s may have learned from these images", settings.network)

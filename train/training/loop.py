@@ -104,7 +104,7 @@ class TrainingStep:
     def __post_init__(self) -> None:
         """Build the optimizer, the loss and the augmentation."""
         settings, model, teacher, service = self.settings, self.model, self.teacher, self.service
-        device = next(model.parameters()).device
+        device = device_of(model)
         # `wrap_ddp` may replace layers of the network. The optimizer is built
         # afterwards, so that it has the parameters of the new layers.
         replica = wrap_ddp(model, None if isinstance(service.task, Detection) else self.size)
@@ -230,7 +230,7 @@ class Trainer:
         # Time of the last checkpoint or, before that, of the start; and seconds that it took.
         self._saved_at, self._saving_took = time.perf_counter(), 0.0
 
-        self.device = next(model.parameters()).device
+        self.device = device_of(model)
         self.initial = deepcopy(model).eval().requires_grad_(False) if self.has_initial else None
         self.averages = Averages(model, settings.ema_decay, settings.soup)
         self.selected = self.averages.selected
@@ -309,8 +309,7 @@ class Trainer:
                     # Each epoch of a soup runs through the whole schedule of the learning rate.
                     if not settings.soup:
                         done = (self.epoch + done) / settings.epochs
-                    number = self.epoch * sum(steps) + state.step
-                    state.sums += self.step.take(batch, done, number)
+                    state.sums += self.step.take(batch, done, self.epoch * sum(steps) + state.step)
                     self.averages.end_step()
                     state.step += 1
                     # After its last step, the epoch counts as trained, even if a signal came.
