@@ -12,7 +12,7 @@ from renderer.errors import InputError, as_list, describe
 from renderer.mesh import Mesh
 from renderer.solids import HARD_NEGATIVES, SOLIDS
 from train import settings as common
-from train.settings import ExperimentSettings, is_of_no_class, label_names, simplified, solid_name
+from train.settings import ExperimentSettings, is_of_no_class, simplified, solid_name
 
 # File of a mesh, solid:NAME, or the mesh itself.
 MeshSource = str | Path | Mesh
@@ -145,7 +145,7 @@ def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> Ex
         # A dictionary has each name once, in the order of the meshes.
         names = [*dict.fromkeys(found)]
     else:
-        names = [class_name(classes, name, "label") for name in label_names(settings.label)]
+        names = [class_name(classes, name, "label") for name in settings.labels]
         meshes = settings.meshes
     meshes = with_class_name(meshes, classes, "meshes")
     negatives = with_class_name(settings.hard_negatives, classes, "hard_negatives")

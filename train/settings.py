@@ -379,7 +379,7 @@ class ExperimentSettings(NetworkSettings):
             # are known. `with_class_names` then creates these settings again.
             return
         # A generated hard negative whose name is a positive class is removed.
-        positives = {simplified(name) for name in label_names(self.label)}
+        positives = {simplified(name) for name in self.labels}
         self.hard_negatives = [
             item
             for item in self.hard_negatives
@@ -387,6 +387,11 @@ class ExperimentSettings(NetworkSettings):
         ]
         if renders_meshes:
             require_range("meshes × views × backgrounds", self.render_count, 1, MAX_EXAMPLES)
+
+    @property
+    def labels(self) -> list[str]:
+        """Names of the positive classes. Empty if the label is not set."""
+        return [] if self.label is None else label_names(self.label)
 
     @property
     def scored_folders(self) -> dict[str, Path]:
@@ -433,7 +438,7 @@ class ExperimentSettings(NetworkSettings):
         With several positive classes, it is of the class that the name of its
         solid tells: "solid:orange" is an orange.
         """
-        labels = label_names(self.label)
+        labels = self.labels
         default_label = labels[0] if len(labels) == 1 else ""
         # An empty label is unknown, and follows from the name of a solid.
         objects = read_objects(self.meshes, default_label, "meshes") | self.negative_objects

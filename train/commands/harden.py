@@ -179,10 +179,9 @@ def harden(
         if out is None:
             # Nothing is written outside of the temporary folder.
             changes["train"]["cache"] = None
-        experiment = "detector" if is_detector else "classifier"
         sections: dict[str, Any] = {"train": train, "augment": augment, "scene": scene}
         sections |= {"renderer": renderer, "data": data}
-        settings = _read_settings(experiment, changes, sections)
+        settings = _read_settings("detector" if is_detector else "classifier", changes, sections)
         if settings.train.recognize and not isinstance(network, TaskNetwork):
             fault = "train.recognize=true needs a network that keeps what recognizes the light"
             raise InputError(f"{fault}: give an nb.Classifier instead", "train.recognize")

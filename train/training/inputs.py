@@ -32,14 +32,7 @@ from train.data.photographs import find_photographs, load_photographs
 from train.data.rendered_shapes import cache_folder, load_shapes
 from train.device import choose_rasterizer, main_process_first
 from train.networks import CLASSIFIER, describe
-from train.settings import (
-    MIN_SIZE,
-    OTHER,
-    UNLABELED,
-    ExperimentSettings,
-    label_names,
-    published_folder,
-)
+from train.settings import MIN_SIZE, OTHER, UNLABELED, ExperimentSettings, published_folder
 
 # Default fraction of the training images that validate the network.
 VALIDATION = 0.1
@@ -153,7 +146,7 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
     of the meshes. The names of the classes are known from the initial network. Without one, the
     settings stay.
     """
-    names = [] if settings.label is None else label_names(settings.label)
+    names = settings.labels
     if len(names) == 1 and settings.augment.renders:
         files = [item for item in settings.meshes if isinstance(item, str)]
         others = [file for file in files if class_of_name(name_of_mesh(file), names) is None]
@@ -292,7 +285,7 @@ def require_label(settings: ExperimentSettings, data: sets.DataSet) -> None:
     if settings.label is None and (settings.augment.renders or settings.train.ranking_weight > 0):
         advice = f"give a class of the meshes, such as {', '.join(data.classes[:5])}"
         raise InputError(f"label is not set: {advice}", "label")
-    for label in () if settings.label is None else label_names(settings.label):
+    for label in settings.labels:
         name = data.classes[class_index(data.classes, label, "label")]
         if name != label and settings.scored_folders:
             raise InputError(f"label={label} is an index: give the name, label={name}", "label")
@@ -344,11 +337,10 @@ def build_service(
     images: Tensor | None = None
     labels = torch.zeros(0, dtype=torch.int64)
     phases = Phases(device)
-    names = [] if settings.label is None else label_names(settings.label)
     # The ranking loss compares images of a positive class with images of other classes. It
     # needs both.
-    is_ranked = is_classifier and (bool(settings.hard_negatives) or len(names) > 1)
-    positive_classes = [class_index(data.classes, name, "label") for name in names]
+    is_ranked = is_classifier and (bool(settings.hard_negatives) or len(settings.labels) > 1)
+    positive_classes = [class_index(data.classes, name, "label") for name in settings.labels]
     if settings.augment.renders and settings.augment.mode == "folder":
         images, labels = load_renders(settings, data, positive_classes)
         images = images.to(device)

@@ -29,14 +29,7 @@ from augment.tasks.detection import Detection
 from renderer.errors import InputError, explained, keyed, require_memory
 from renderer.image import to_bytes, to_unit
 from train import checkpoints, console, run_folder
-from train.data.batches import (
-    Batch,
-    Round,
-    TrainingImages,
-    round_size,
-    rounds_of_epoch,
-    training_batches,
-)
+from train.data.batches import Batch, TrainingImages, round_size, rounds_of_epoch, training_batches
 from train.data.sets import Split
 from train.device import MixedPrecision, SignalHandler, all_reduce_sum, compiles, wrap_ddp
 from train.settings import TrainSettings
@@ -282,7 +275,7 @@ class Trainer:
             cuda.set_rng_state_all(self._random_state["cuda"][: cuda.device_count()])
         else:
             self.averages.begin_epoch(self.initial, self.step.optimizer)
-            renders = self._regenerate(rounds[0])
+            renders = self._regenerate(rounds[0].number)
             sums = torch.zeros(2, device=self.device)
             self._epoch_state = EpochState(renders, sums, [renders.diagnostics])
         state = self._epoch_state
@@ -290,7 +283,7 @@ class Trainer:
         begun = len(state.diagnostics)
         for index, now in [*enumerate(rounds)][begun - 1 :]:
             if index >= begun:
-                state.renders = self._regenerate(now)
+                state.renders = self._regenerate(now.number)
                 state.diagnostics.append(state.renders.diagnostics)
             title = f"epoch {self.epoch + 1}"
             if len(rounds) > 1:
@@ -319,11 +312,11 @@ class Trainer:
                         self._save()
         return True
 
-    def _regenerate(self, now: Round) -> Renders:
+    def _regenerate(self, number: int) -> Renders:
         """Render the training renders of a round anew, and log images of a few attacks on them."""
-        torch.manual_seed(stream_seed(self.seed, now.number, "dropout"))
+        torch.manual_seed(stream_seed(self.seed, number, "dropout"))
         with self.phases("attack"):
-            renders = self.service.regenerate(self.model, now.number)
+            renders = self.service.regenerate(self.model, number)
         if renders.targets is not None:
             renders = replace(renders, labels=object_maps(renders.targets).to(self.device))
         if self._log and renders.attack_examples:

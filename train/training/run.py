@@ -153,11 +153,11 @@ class Run:
             light = light or initial.architecture.get(checkpoints.NORMALIZE_LIGHT)
         if light is not None:
             facts[checkpoints.NORMALIZE_LIGHT] = light
-            network = exposure.with_normalized_light(network, light)
+        wrapped = exposure.with_normalized_light(network, light)
         if recipe.freeze:
             with keyed(stage="train.freeze"):
                 freeze(wrappers.unwrapped(network), recipe.freeze, data.size)
-        model = place(network, recipe, data.size, threads)
+        model = place(wrapped, recipe, data.size, threads)
         device = wrappers.device_of(model)
         # By default, pretrained classifiers keep the statistics of their normalizations.
         if recipe.eval_mode is None:
@@ -167,8 +167,7 @@ class Run:
             console.info("learning rate %.3g, by the norm of the features of the network", rate)
             recipe = replace(recipe, learning_rate=rate)
         # The checkpoint describes the network without the wrapper, and the wrapper by its settings.
-        inner = exposure.without_normalized_light(network)
-        description = describe(inner, **facts, validation=validation)
+        description = describe(network, **facts, validation=validation)
         task = initial.task if initial else Classification()
         service = inputs.build_service(settings, data, device, task)
         options = description, service, self.folder, data.labeled, initial is not None
