@@ -268,8 +268,7 @@ def _choice_lines(group: str) -> Iterator[str]:
     """Yield the lines of --help about choices, with the first sentence of their files' comment."""
     for path in sorted((CONF / group.partition("@")[0]).glob("*.yaml")):
         lines = path.read_text(encoding="utf-8").splitlines()
-        comments = [line.removeprefix("# ") for line in lines if line.startswith("# ")]
-        text = " ".join(line for line in comments if not line.startswith("@package"))
+        text = " ".join(line[2:] for line in lines if re.match("# (?!@package)", line))
         yield _format_line(f"{group}={path.stem}", text.partition(". ")[0].removesuffix("."))
 
 
@@ -296,7 +295,7 @@ def format_facts(kind: type, name: str) -> str:
     facts = facts_of(kind, name)
     limits = [f"{sign} {end:g}" for _, sign, _, end in facts.limits]
     notes = [" | ".join(facts.choices), facts.unit, ", ".join(limits)]
-    given = "; ".join(note for note in notes if note)
+    given = "; ".join(filter(None, notes))
     return f"{facts.about} [{given}]" if given else facts.about
 
 

@@ -75,8 +75,6 @@ NO_PHOTOGRAPHS = (
     "photos shows no objects of other classes, and a hardened network may take similar objects on "
     "real photographs for the class, which renders do not show: give photographs of such objects."
 )
-# Settings of pnb-audit that name the folders of test images, by the name of the images.
-FOLDER_KEYS = {LABORATORY: "laboratory", PHOTOGRAPHS: "photos"}
 # When a stopped audit continues, these settings may be set if they were not set before.
 SETTABLE_LATER = ("hardened", "photos", "unlabeled")
 # The networks of an audit, by their keys CLASSIFIER and HARDENED.
@@ -363,7 +361,7 @@ class _Plan:
             for name in labels:
                 network.label(name)
             for name, folder in self.image_folders.items():
-                with keyed(FOLDER_KEYS[name]):
+                with keyed("photos" if name == PHOTOGRAPHS else "laboratory"):
                     found = find_photographs(folder, network.classes, self.label)
                 if name == PHOTOGRAPHS:
                     self.has_other_photographs = bool({item.label for item in found} - {self.label})

@@ -55,8 +55,8 @@ class MovingAverage(AveragedModel):
         for is_floating in (True, False):
             chosen = [pair for pair in pairs if pair[0].is_floating_point() == is_floating]
             if chosen:
-                old = [average.detach() for average, _ in chosen]
-                self._average(old, [value.detach() for _, value in chosen], None)
+                old, new = zip(*chosen, strict=True)
+                self._average(old, new, None)
         self.n_averaged += 1
 
 
