@@ -292,14 +292,13 @@ def selected_file(run: Path) -> Path | None:
     return next(filter(Path.is_file, (found, found / BEST, found / PUBLISHED)), None)
 
 
-def is_state_dict(path: Path) -> bool:
-    """Return whether a file has a state dict: weights without a description of their network.
+def lacks_architecture(path: Path) -> bool:
+    """Return whether a file has weights without a description of their network.
 
     `torch.save(network.state_dict(), path)` writes such a file.
     """
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        return all(isinstance(value, Tensor) for value in content.values())
+        return "architecture" not in torch.load(path, map_location="cpu", weights_only=True)
     except Exception:  # `torch.load` raises errors of many types for other files.
         return False
 

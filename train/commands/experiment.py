@@ -217,8 +217,7 @@ def sweep(
     parent = writable_folder(str(first_config.sweep), "sweep")
     # An earlier report about the same sweep may be replaced.
     require_replaceable(parent, "sweep", first_config.overwrite, own=[PAGE])
-    shared = set.intersection(*map(set, runs))
-    shared_keys = [override.partition("=")[0] for override in shared]
+    shared_keys = [word.partition("=")[0] for word in set.intersection(*map(set, runs))]
     folders = [parent / run_name(overrides, shared_keys, str(parent)) for overrides in runs]
     if len(set(folders)) < len(runs):
         raise InputError("the sweep has two runs with the same settings: give each value once")
@@ -278,9 +277,8 @@ def _run(config: DictConfig, folder: Path) -> None:
         try:
             settings = with_label(read_settings(ExperimentSettings, config))
             settings.train.resume = checkpoints.exists(folder)
-            command = format_command(job.overrides.task)
             data, initial = load_inputs(settings)
-            run = Run(settings, data, folder, initial, command)
+            run = Run(settings, data, folder, initial, format_command(job.overrides.task))
             run.begin()
             run.train()
         except Exception as error:

@@ -111,14 +111,11 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
         return None
     if name.startswith(SWITCHES):
         raise InputError(f"network={name} has two networks: train one of them", "network")
-    # A classifier comes from a library or a file. Any other name is the folder of a training run.
-    if checkpoints.is_classifier(name):
+    # A classifier comes from a library or a file, and a file of weights alone is refused like it.
+    # Any other name is the folder of a training run.
+    if checkpoints.is_classifier(name) or checkpoints.lacks_architecture(Path(name)):
         return _load_classifier(settings, name)
     source = Path(name.removeprefix(checkpoints.RUN))
-    # A file of weights alone does not say which network they belong to.
-    if checkpoints.is_state_dict(source):
-        advice = f"give both, as in network=torchvision:resnet50 weights={source}"
-        raise InputError(f"network={name} has weights, but no architecture: {advice}", "network")
     if settings.weights is not None:
         raise InputError(f"weights: network={name} has its own: leave weights out", "weights")
     # The network of a run has its own classes and its own normalization.
@@ -126,14 +123,14 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
     require_no_facts(f"network={name}", stated_facts)
     with keyed(run="network"):
         path, state = checkpoints.load_selected(source)
+    architecture = state["architecture"]
     # A run of a network that a Python function built names this function. To call it means to run
     # code, which the user must allow.
-    built_by = str(state["architecture"].get("name"))
+    built_by = str(architecture.get("name"))
     is_named = split_function(settings.model.name) == split_function(built_by)
     if built_by.startswith(PYTHON) and not is_named and not settings.trust:
         advice = f"give model.name={built_by} to run that code"
         raise InputError(f"the network in {path} is built by {built_by}: {advice}", "network")
-    architecture = state["architecture"]
     # Who stated size and normalization of the network: its file, or nobody.
     stated = checkpoints.stated_inputs(architecture)
     return Initial(path, architecture, checkpoints.plain_weights(state), inputs=stated)
@@ -169,11 +166,10 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
 
 def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
     """Load a classifier, from another library or from a file, as the initial network."""
-    size = settings.size
     with keyed(name="network"):
         # A file may not record the size of its images, so it gets the size of the settings.
         # Any other classifier has a size of its own.
-        given_size = size if is_network_file(name) else None
+        given_size = settings.size if is_network_file(name) else None
         facts = as_facts(settings.classes, given_size, settings.normalization, settings.prompt)
         weights = Path(settings.weights) if settings.weights else None
         classifier = load_source(name, weights, facts, settings.trust)
@@ -186,7 +182,7 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
         advice = "give a file of TorchScript or torch.export"
         raise InputError(f"network={name} has no weights to train: {advice}", "network")
     # A run builds the network again, since modules of TorchScript cannot be copied.
-    return replace(initial_of(classifier, size), source=Path(name), network=None)
+    return replace(initial_of(classifier, settings.size), source=Path(name), network=None)
 
 
 def initial_of(classifier: TaskNetwork, size: int | None) -> Initial:
