@@ -46,9 +46,6 @@ from train.system import NO_ROOM, is_verbose, program, shortened, user_message
 from train.training.inputs import load_inputs, with_label
 from train.training.run import Run
 
-# An override such as experiment=photographs chooses a file of settings. These keys
-# are the folders of such files in conf/.
-CHOICES = ("experiment", "augment", "data", "launcher")
 # Name of the log file in the folder of a training run.
 LOG = "train.log"
 # The first training on photographs takes these settings from the main training.
@@ -73,23 +70,22 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
         # A resumed run keeps its recorded settings, except for single values that the
         # overrides change. A choice of a whole file, or of photographs_first, prevents this.
         keys = [override.partition("=")[0] for override in overrides]
-        is_whole = config.photographs_first or any(key in CHOICES or "@" in key for key in keys)
+        is_whole = config.photographs_first or any(key in main.groups or "@" in key for key in keys)
         if config.train.resume and not is_whole:
             config, command = resume_config(config, overrides)
         settings = with_label(read_settings(ExperimentSettings, config))
         if settings.photographs_first:
-            settings = _train_on_photographs(settings, folder, command)
+            settings = _train_on_photographs(settings, command)
         _train_in(folder, settings, command, folder)
 
 
-def _train_on_photographs(
-    settings: ExperimentSettings, folder: Path, command: str
-) -> ExperimentSettings:
+def _train_on_photographs(settings: ExperimentSettings, command: str) -> ExperimentSettings:
     """Train on photographs first, as the setting `photographs_first` asks.
 
     If this first training is already finished, it is not repeated. The returned settings are those
     of the main training, which starts from the network of the first.
     """
+    folder = Path(settings.out)
     first = folder / PHOTOGRAPHS_FIRST
     values = asdict(settings)
     changes = {name: values[name] for name in SHARED} | {"out": str(first)}
