@@ -154,7 +154,7 @@ def publish(
         32
     """
     require_calibration(false_positive_rate, calibrate)
-    target = writable_folder(str(as_path("out", out)), "out")
+    target = writable_folder(as_path("out", out), "out")
     folder = as_path("run", run)
     path, state = load_selected(folder)
     # `run` may be the folder of a published network, which is then replaced, for example

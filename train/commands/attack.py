@@ -256,12 +256,11 @@ def build_attacked(
     one example for each background. Otherwise it has one example for each pair
     of a view and a background.
     """
-    options: dict[str, Any] = {"attack": settings.attack, "shared": settings.attack.shared}
-    options |= {"scene": scene, "renderer": settings.renderer}
-    options |= {"rasterizer": choose_rasterizer(settings.renderer)}
+    options: dict[str, Any] = {"scene": scene, "device": choose_device(settings.device)}
+    options |= {"attack": settings.attack, "shared": settings.attack.shared}
+    options |= {"renderer": settings.renderer, "rasterizer": choose_rasterizer(settings.renderer)}
     with keyed("scene", **keys_of("scene", scene)):
-        device = choose_device(settings.device)
-        return build_scene([item], size, scene.views, device=device, **options)
+        return build_scene([item], size, scene.views, **options)
 
 
 def _labeled(settings: AttackExperimentSettings, classes: Sequence[str]) -> list[ObjectSettings]:
