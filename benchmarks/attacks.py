@@ -55,13 +55,13 @@ def time_alone(network: torch.nn.Module, calls: list[tuple[float, torch.Tensor, 
 
 def measure(parameter: str, words: list[str]) -> None:
     """Print the medians of `ROUNDS` attacks on one parameter, after one that compiles."""
-    settings = main.read([f"attack=[{parameter}]", *words])
+    settings = main.read([f"attack=[{parameter}]", "device=cpu", *words])
     network = load_chosen(settings)
     rows = []
     for _ in range(1 + ROUNDS):
         with recorded_calls(network) as calls:
             start = process_time()
-            found = list(attacks(settings, network, torch.device("cpu")))
+            found = list(attacks(settings, network))
             seconds = process_time() - start
         first = next(time for time, _, has_gradient in calls if has_gradient) - start
         alone = time_alone(network, calls)

@@ -20,7 +20,7 @@ from zipfile import ZipFile
 import safetensors.torch
 import torch
 from safetensors import safe_open
-from torch import Tensor, cuda
+from torch import Tensor
 
 from augment.classifier import Classifier, OperatingPoint, TaskNetwork
 from augment.exposure import DIM, with_normalized_light
@@ -110,22 +110,6 @@ def load_newest(folder: Path) -> tuple[dict[str, Any], str | None]:
         return load(folder / PREVIOUS), str(error)
 
 
-def random_state() -> dict[str, Tensor | list[Tensor]]:
-    """Return the states of the random generators of torch. "cuda" has one state for each GPU."""
-    states = cuda.get_rng_state_all() if cuda.is_available() else []
-    return {"cpu": torch.get_rng_state(), "cuda": states}
-
-
-def restore_random_state(state: Mapping[str, Any]) -> None:
-    """Set the random generators of torch to states that `random_state` returned.
-
-    Surplus states or GPUs are ignored.
-    """
-    torch.set_rng_state(state["cpu"])
-    for device, values in zip(range(cuda.device_count()), state["cuda"], strict=False):
-        cuda.set_rng_state(values, device)
-
-
 def load_network(
     name: str,
     weights: str | Path | None = None,
@@ -141,7 +125,6 @@ def load_network(
     The arguments other than `name` are those of `nb.load_classifier`. The network of a run has
     its own weights and its own `facts`, such as classes and size, so these must then be None.
     """
-    require_kind("name", name, str, "the name of a classifier, such as 'torchvision:resnet50'")
     if name.startswith(SWITCHES):
         plain, other = split_switch(name)
         network = load_network(plain, weights, trust_code=trust_code, **facts)
@@ -280,9 +263,6 @@ def load_run(
             loaded = Classifier(*facts)
             points = state.get("operating_point", [])
             loaded.operating_points = [OperatingPoint(**values) for values in points]
-            for point in loaded.operating_points:
-                # This call raises InputError if the network lacks the class.
-                loaded.label(point.label)
         loaded.inputs = stated_inputs(state["architecture"])
         if RECOGNIZER in state:
             loaded.recognizer = Recognizer(network, **state[RECOGNIZER])
@@ -312,14 +292,13 @@ def selected_file(run: Path) -> Path | None:
     return next(filter(Path.is_file, (found, found / BEST, found / PUBLISHED)), None)
 
 
-def is_state_dict(path: Path) -> bool:
-    """Return whether a file has a state dict: weights without a description of their network.
+def lacks_architecture(path: Path) -> bool:
+    """Return whether a file has weights without a description of their network.
 
     `torch.save(network.state_dict(), path)` writes such a file.
     """
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
-        return all(isinstance(value, Tensor) for value in content.values())
+        return "architecture" not in torch.load(path, map_location="cpu", weights_only=True)
     except Exception:  # `torch.load` raises errors of many types for other files.
         return False
 

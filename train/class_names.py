@@ -12,7 +12,7 @@ from renderer.errors import InputError, as_list, describe
 from renderer.mesh import Mesh
 from renderer.solids import HARD_NEGATIVES, SOLIDS
 from train import settings as common
-from train.settings import ExperimentSettings, is_of_no_class, label_names, simplified, solid_name
+from train.settings import ExperimentSettings, is_of_no_class, simplified, solid_name
 
 # File of a mesh, solid:NAME, or the mesh itself.
 MeshSource = str | Path | Mesh
@@ -33,10 +33,11 @@ def class_name(classes: Sequence[str], label: str | int, key: str) -> str:
 def with_class_name(item: Any, classes: Sequence[str], key: str) -> Any:
     """Return the settings of a mesh, in which its class is given by name instead of by index.
 
-    The same holds for the objects beside it. A mapping without a label, or with one that no network
-    has, such as "other_lemon", keeps it. Only a mapping can have a label.
+    The same holds for the objects beside it, and for a list of meshes. A mapping without a label,
+    or with one that no network has, such as "other_lemon", keeps it. Only a mapping can have a
+    label.
     """
-    if isinstance(item, list):
+    if isinstance(item, list | tuple):
         return [with_class_name(one, classes, key) for one in item]
     if not isinstance(item, dict):
         return item
@@ -44,7 +45,7 @@ def with_class_name(item: Any, classes: Sequence[str], key: str) -> Any:
     if not is_of_no_class(item.get("label")):
         named["label"] = class_name(classes, item["label"], f"{key}.label")
     if item.get("others"):
-        named["others"] = [with_class_name(other, classes, key) for other in item["others"]]
+        named["others"] = with_class_name(item["others"], classes, key)
     return named
 
 
@@ -144,11 +145,10 @@ def with_class_names(settings: ExperimentSettings, classes: Sequence[str]) -> Ex
         # A dictionary has each name once, in the order of the meshes.
         names = [*dict.fromkeys(found)]
     else:
-        names = [class_name(classes, name, "label") for name in label_names(settings.label)]
+        names = [class_name(classes, name, "label") for name in settings.labels]
         meshes = settings.meshes
-    meshes = [with_class_name(item, classes, "meshes") for item in meshes]
-    key = "hard_negatives"
-    negatives = [with_class_name(item, classes, key) for item in settings.hard_negatives]
+    meshes = with_class_name(meshes, classes, "meshes")
+    negatives = with_class_name(settings.hard_negatives, classes, "hard_negatives")
     # A single positive class is given by its name, several are given as a list.
     label = names[0] if len(names) == 1 else names
     return replace(settings, label=label, meshes=meshes, hard_negatives=negatives)
@@ -165,10 +165,9 @@ def as_mappings(name: str, items: Sequence[MeshItem]) -> list[dict[str, Any]]:
         key = f"{name}[{index}]"
         # A list of objects is one mesh with others around it, which are in the same render.
         if isinstance(item, list) and any(isinstance(of, tuple | ObjectSettings) for of in item):
-            mapping, *others = as_mappings(key, item)
-            mappings.append(mapping | {"others": [*mapping.get("others", ()), *others]})
-            continue
-        if isinstance(item, ObjectSettings):
+            first, *others = as_mappings(key, item)
+            mapping = first | {"others": [*first.get("others", ()), *others]}
+        elif isinstance(item, ObjectSettings):
             mapping = asdict(item)
         else:
             # Other items are a source, or a pair of a source and a class.

@@ -169,17 +169,11 @@ class Command:
         """
         self.register()
         words = self.to_overrides(overrides) if as_typed else list(overrides)
-        try:
-            # While a command runs, Hydra is initialized, and must not be initialized again.
-            if GlobalHydra.instance().is_initialized():
-                return hydra.compose(self.name, words)
-            with initialize_config_module("conf", version_base="1.3"):
-                return hydra.compose(self.name, words)
-        except Exception as error:
-            sentence = explain(error, self.keys, words)
-            if sentence is None:
-                raise
-            raise InputError(sentence) from error
+        # While a command runs, Hydra is initialized, and must not be initialized again.
+        if GlobalHydra.instance().is_initialized():
+            return hydra.compose(self.name, words)
+        with initialize_config_module("conf", version_base="1.3"):
+            return hydra.compose(self.name, words)
 
     def read(self, overrides: Sequence[str] = (), as_typed: bool = True) -> Any:
         """Return the settings that the command would have with the arguments of `compose`."""
@@ -274,8 +268,7 @@ def _choice_lines(group: str) -> Iterator[str]:
     """Yield the lines of --help about choices, with the first sentence of their files' comment."""
     for path in sorted((CONF / group.partition("@")[0]).glob("*.yaml")):
         lines = path.read_text(encoding="utf-8").splitlines()
-        comments = [line.removeprefix("# ") for line in lines if line.startswith("# ")]
-        text = " ".join(line for line in comments if not line.startswith("@package"))
+        text = " ".join(line[2:] for line in lines if re.match("# (?!@package)", line))
         yield _format_line(f"{group}={path.stem}", text.partition(". ")[0].removesuffix("."))
 
 
@@ -302,7 +295,7 @@ def format_facts(kind: type, name: str) -> str:
     facts = facts_of(kind, name)
     limits = [f"{sign} {end:g}" for _, sign, _, end in facts.limits]
     notes = [" | ".join(facts.choices), facts.unit, ", ".join(limits)]
-    given = "; ".join(note for note in notes if note)
+    given = "; ".join(filter(None, notes))
     return f"{facts.about} [{given}]" if given else facts.about
 
 

@@ -305,16 +305,13 @@ class EvaluateSettings(TaskSettings):
     def __post_init__(self) -> None:
         """Check all values, and that the settings name one network."""
         super().__post_init__()
-        require_calibration(self.false_positive_rate, self.calibrate)
-        if self.label is not None:
-            common.label_names(self.label)  # This call only checks the label.
         # With `run`, `network` may only name the function that built the network of the run.
-        builds_run = bool(self.network and self.network.startswith(scenes.PYTHON))
+        builds_run = (self.network or "").startswith(scenes.PYTHON)
         if (self.run is None) == (self.network is None) and not (self.run and builds_run):
             raise InputError(f"run={self.run} and network={self.network} do not match: give one")
 
 
-def require_calibration(rate: float | None, calibrate: str | None) -> None:
+def require_calibration(rate: float | None, calibrate: str | Path | None) -> None:
     """Check that the two settings that choose a threshold are given together.
 
     The threshold on the score of a class is chosen so that a given fraction of the negatives in a

@@ -29,8 +29,7 @@ def small_detector(class_count: int, size: int) -> SSD:
         layers.append(BasicBlock(inputs, outputs, 2, shortcut))
     # The names of the last SEEN layers, from whose features boxes are found.
     seen = {str(index): str(index) for index in range(len(layers))[-SEEN:]}
-    low, high = BOX_SIZES
-    boxes = DefaultBoxGenerator([[2, 3]] * SEEN, min_ratio=low, max_ratio=high)
+    boxes = DefaultBoxGenerator([[2, 3]] * SEEN, *BOX_SIZES)
     per_location = boxes.num_anchors_per_location()
     return SSD(
         IntermediateLayerGetter(nn.Sequential(*layers), seen),

@@ -107,10 +107,9 @@ def choose_precision(precision: str, device: torch.device, trained: nn.Module | 
     """
     require_choice("precision", precision, ("auto", *PRECISIONS))
     is_gpu = device.type == "cuda"
-    is_x86 = platform.machine() in ("x86_64", "AMD64")
     if is_gpu:
         is_native = torch.cuda.is_bf16_supported(including_emulation=False)
-    elif device.type == "cpu" and is_x86:
+    elif device.type == "cpu" and platform.machine() in ("x86_64", "AMD64"):
         is_native = torch.cpu._is_avx512_bf16_supported()
     else:
         is_native = device.type == "cpu" and torch.ops.mkldnn._is_mkldnn_bf16_supported()
@@ -309,15 +308,13 @@ class SignalHandler:
                     self._handlers[number] = signal.signal(number, self._note)
         return self
 
-    def __exit__(
-        self, error: type[BaseException] | None, value: BaseException | None, *rest: object
-    ) -> None:
+    def __exit__(self, _: object, error: BaseException | None, *rest: object) -> None:
         """Restore the handlers, and let a noted signal take effect unless an error is raised."""
         self._restore()
         if error is None and self._number is not None:
             signal.raise_signal(self._number)
         # A job sends the signal to all its processes, also to those that read images.
-        if self._number is not None and "DataLoader worker" in str(value):
+        if self._number is not None and "DataLoader worker" in str(error):
             self.stop()
 
     def requested(self) -> bool:

@@ -153,8 +153,8 @@ def publish(
         >>> nb.load_run("published/best").size
         32
     """
-    require_calibration(false_positive_rate, None if calibrate is None else str(calibrate))
-    target = writable_folder(str(as_path("out", out)), "out")
+    require_calibration(false_positive_rate, calibrate)
+    target = writable_folder(as_path("out", out), "out")
     folder = as_path("run", run)
     path, state = load_selected(folder)
     # `run` may be the folder of a published network, which is then replaced, for example

@@ -72,8 +72,7 @@ def write_config(folder: Path, settings: Any, **facts: object) -> None:
     """
     folder.mkdir(parents=True, exist_ok=True)
     # Relative paths in the command are relative to this folder.
-    if "command" in facts:
-        facts["working_folder"] = os.getcwd()
+    facts["working_folder"] = os.getcwd()
     # This import is here because results of runs are read without torch.
     from torch import __version__ as torch_version
 
@@ -159,7 +158,7 @@ def require_same_run(folder: Path, settings: ExperimentSettings, done: bool = Fa
     """
 
     def is_permitted(key: str, old: Any, new: Any) -> bool:
-        is_longer = key == "train.epochs" and isinstance(old, int) and new > old
+        is_longer = key == "train.epochs" and new > old
         # A finished run may not differ at all.
         return not done and (is_longer or key.startswith(("evaluate.", "photos")))
 
@@ -192,9 +191,8 @@ def require_same_inputs(
     folder: Path, settings: Any, recorded: Mapping[Any, Any], elsewhere: str
 ) -> None:
     """Check that input files are as when a folder began, by the fingerprints in its facts."""
-    hashes = recorded.get("inputs") or {}
     for path, fingerprint in fingerprints(settings).items():
-        if hashes.get(path, fingerprint) != fingerprint:
+        if recorded.get("inputs", {}).get(path, fingerprint) != fingerprint:
             advice = f"put it back, or set another {elsewhere}"
             raise InputError(f"{path} has changed since {folder} began: {advice}")
 
@@ -206,9 +204,8 @@ def require_same_weights(
 
     The networks are found by the same keys in `hashes`, in `names` and in the facts.
     """
-    known = recorded.get("hashes") or {}
     for key, found in hashes.items():
-        if known.get(key, found) != found:
+        if recorded.get("hashes", {}).get(key, found) != found:
             fault = f"{names[key]} has other weights than when {folder} began"
             raise InputError(f"{fault}: put them back, or set another out=")
 

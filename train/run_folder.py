@@ -106,7 +106,7 @@ def locked(folder: Path) -> Iterator[bool]:
 
 
 @contextmanager
-def sole_writer(key: str, *folders: Path) -> Iterator[None]:
+def sole_writer(*folders: Path) -> Iterator[None]:
     """Lock folders until the block ends, so that no other process writes to them.
 
     Folders into which the block has written nothing are removed at the end.
@@ -114,7 +114,7 @@ def sole_writer(key: str, *folders: Path) -> Iterator[None]:
     with ExitStack() as stack:
         for folder in folders:
             if not stack.enter_context(locked(folder)):
-                raise InputError(f"{key}={folder} is in use by another process: choose another")
+                raise InputError(f"out={folder} is in use by another process: choose another")
         try:
             yield
         finally:

@@ -358,7 +358,16 @@ class ExperimentSettings(NetworkSettings):
             if value and not self.network:
                 key = f"train.{name}"
                 raise InputError(f"{key}={value} needs an initial network: set network", key)
-        self._check_photographs()
+        if self.data.name == UNLABELED and not self.unlabeled:
+            raise InputError("unlabeled is not set: give a folder of photographs", "unlabeled")
+        folders = self.photos.values() if isinstance(self.photos, dict) else [self.photos or ""]
+        if not all(isinstance(folder, str) for folder in folders):
+            raise self.wrong("photos", "must be a folder, or a mapping of names to folders")
+        for name in self.scored_folders:
+            # Each name becomes the name of a sub-folder of the run.
+            if not re.fullmatch(r"\w[\w-]*", name) or name in RESERVED:
+                advice = f"choose letters, digits, _ and -, and none of {', '.join(RESERVED)}"
+                raise InputError(f"photos has the name {name!r} for a folder: {advice}", "photos")
         renders_meshes = self.augment.renders and self.augment.mode != "folder"
         if renders_meshes:
             self.scene = self.scene.with_lights(self.augment.attack.parameters)
@@ -370,7 +379,7 @@ class ExperimentSettings(NetworkSettings):
             # are known. `with_class_names` then creates these settings again.
             return
         # A generated hard negative whose name is a positive class is removed.
-        positives = {simplified(name) for name in label_names(self.label)}
+        positives = {simplified(name) for name in self.labels}
         self.hard_negatives = [
             item
             for item in self.hard_negatives
@@ -379,29 +388,10 @@ class ExperimentSettings(NetworkSettings):
         if renders_meshes:
             require_range("meshes × views × backgrounds", self.render_count, 1, MAX_EXAMPLES)
 
-    def _check_photographs(self) -> None:
-        """Check the folders of photographs: each scored one can have a sub-folder of scores."""
-        if self.data.name == UNLABELED and not self.unlabeled:
-            raise InputError("unlabeled is not set: give a folder of photographs", "unlabeled")
-        folders = self.photos.values() if isinstance(self.photos, dict) else [self.photos or ""]
-        if not all(isinstance(folder, str) for folder in folders):
-            raise self.wrong("photos", "must be a folder, or a mapping of names to folders")
-        for name in self.scored_folders:
-            # Each name becomes the name of a sub-folder of the run.
-            if not re.fullmatch(r"\w[\w-]*", name) or name in RESERVED:
-                advice = f"choose letters, digits, _ and -, and none of {', '.join(RESERVED)}"
-                raise InputError(f"photos has the name {name!r} for a folder: {advice}", "photos")
-
     @property
-    def label_follows_from_meshes(self) -> bool:
-        """Whether a label that is not set is the list of the classes of the meshes.
-
-        The run must train on objects of the positive classes, or score images of them.
-        """
-        is_scored = bool(self.photos) or self.evaluate.laboratory_setups > 0
-        is_used = self.augment.renders or self.train.ranking_weight > 0 or is_scored
-        has_meshes = bool(self.meshes) and self.augment.mode != "folder"
-        return self.label is None and has_meshes and is_used
+    def labels(self) -> list[str]:
+        """Names of the positive classes. Empty if the label is not set."""
+        return [] if self.label is None else label_names(self.label)
 
     @property
     def scored_folders(self) -> dict[str, Path]:
@@ -448,7 +438,7 @@ class ExperimentSettings(NetworkSettings):
         With several positive classes, it is of the class that the name of its
         solid tells: "solid:orange" is an orange.
         """
-        labels = label_names(self.label)
+        labels = self.labels
         default_label = labels[0] if len(labels) == 1 else ""
         # An empty label is unknown, and follows from the name of a solid.
         objects = read_objects(self.meshes, default_label, "meshes") | self.negative_objects

@@ -207,9 +207,10 @@ def test_a_disk_full_before_the_first_checkpoint_tells_a_command_that_trains(
 def test_a_signal_between_the_two_trainings_of_a_command_tells_one_that_goes_on(
     call, capsys, monkeypatch, no_report, tmp_path, tiny_npz
 ):
-    def train_first(settings, folder, *_):
-        (folder / PHOTOGRAPHS_FIRST).mkdir(exist_ok=True, parents=True)
-        (folder / PHOTOGRAPHS_FIRST / LAST).touch()
+    def train_first(settings, _):
+        first = Path(settings.out, PHOTOGRAPHS_FIRST)
+        first.mkdir(exist_ok=True, parents=True)
+        (first / LAST).touch()
         return replace(settings, photographs_first=False)
 
     data = "data.name=npz", f"data.path={tiny_npz}", "photos=null", "network=null"

@@ -191,7 +191,7 @@ def test_resuming_continues_the_metrics_from_the_checkpoints_epoch(tmp_path, don
     write_epochs(tmp_path, range(done + 1, 4), epochs[:done])
     assert read_metrics(tmp_path) == epochs
     for accuracy in (0.5, 0.25):  # A finished run is scored again.
-        RunLog(tmp_path, epochs).scalars({"test/accuracy": accuracy})
+        RunLog(tmp_path, epochs).scalars({"test/accuracy": accuracy}, 4, is_final=True)
     assert read_metrics(tmp_path) == [*epochs, {"test/accuracy": 0.25}]
     board = EventAccumulator(str(tmp_path)).Reload()
     assert [event.step for event in board.Scalars("train/loss")] == [1, 2, 3]

@@ -95,23 +95,21 @@ def run(settings: AttackExperimentSettings) -> None:
         require_renderers(settings.attack.renderers)
         if adversary is None:
             settings.attack.require_parameters()
-    device = choose_device(settings.device)
-    classifier = load_chosen(settings).to(device)
+    classifier = load_chosen(settings).to(choose_device(settings.device))
     if adversary is not None:
         rasterizer = choose_rasterizer(settings.renderer)
         views = format_reloaded(adversary, rasterizer, classifier, settings.attack)
         print("\n".join(shortened(views)))
         if not settings.attack.parameters:
             return
-    targets = load_targets(settings, classifier, device)
+    targets = load_targets(settings, classifier)
     with _results_of(settings, classifier) as out, catch_warnings():
         if settings.attack.checks is not False:
             # The checks say this for each mesh.
             filterwarnings("ignore", ZERO_GRADIENT)
         attacked = []
         sweeps: dict[str, Sweep] = {}
-        found = attacks(settings, classifier, device, adversary)
-        for index, (name, scene, result) in enumerate(found):
+        for index, (name, scene, result) in enumerate(attacks(settings, classifier, adversary)):
             # The name of a solid has colons, which Windows does not allow in file names.
             folder = out / f"{index}_{Path(name.replace(':', '_')).stem}"
             mesh = _write_attack(name, scene, result, folder, settings, targets)
@@ -157,7 +155,7 @@ def _headings(attacked: Sequence[_AttackedMesh]) -> list[str]:
 def _results_of(settings: AttackExperimentSettings, classifier: Classifier) -> Iterator[Path]:
     """Yield the empty folder of the results, and write config.yaml at the end of the block."""
     out = output_folder(settings.out, settings.overwrite)
-    with sole_writer("out", out):
+    with sole_writer(out):
         remove_attack(out)
         yield out
         images = classifier.describe_inputs()
@@ -193,18 +191,14 @@ def _write_attack(
         details += [f"warning about {name}: {text}" for text in warnings(checks)]
     # Adversaries are shown to other networks, from other sides and on other meshes.
     if any(targets.values()):
-        table = write_transfers(transfer(result, **targets), folder / TRANSFERS)
-        details += table.splitlines()
+        details += write_transfers(transfer(result, **targets), folder / TRANSFERS).splitlines()
     correct = result.clean_correct
     row = (name, len(correct), int(correct.sum()), int(result.success[correct].sum()))
     return _AttackedMesh(row, heading, details)
 
 
 def attacks(
-    settings: AttackExperimentSettings,
-    classifier: Classifier,
-    device: torch.device,
-    adversary: Adversary | None = None,
+    settings: AttackExperimentSettings, classifier: Classifier, adversary: Adversary | None = None
 ) -> Iterator[tuple[str, AttackSceneSettings, AttackResult]]:
     """Attack each mesh of the settings, or the scene of a saved adversary.
 
@@ -232,11 +226,12 @@ def attacks(
         adversary = replace(adversary, settings=shown)
         adversary = resized(adversary, classifier.size or adversary.settings.size)
         # The saved adversary has its own scene, which may be misclassified already.
+        device = choose_device(settings.device)
         scene = adversary.scene(choose_rasterizer(settings.renderer), device)
         yield adversary.shown.name, settings.scene, start(scene, force=True)
         return
     for mesh in _labeled(settings, classifier.classes):
-        build = partial(build_attacked, settings, mesh, size=classifier.size, device=device)
+        build = partial(build_attacked, settings, mesh, size=classifier.size)
         chosen = settings.scene
         try:
             result = start(build(chosen), settings.attack.force)
@@ -253,11 +248,7 @@ def attacks(
 
 
 def build_attacked(
-    settings: AttackExperimentSettings,
-    item: ObjectSettings,
-    scene: AttackSceneSettings,
-    size: Size,
-    device: torch.device,
+    settings: AttackExperimentSettings, item: ObjectSettings, scene: AttackSceneSettings, size: Size
 ) -> Scene:
     """Build the scene in which one mesh is attacked.
 
@@ -265,9 +256,9 @@ def build_attacked(
     one example for each background. Otherwise it has one example for each pair
     of a view and a background.
     """
-    options: dict[str, Any] = {"attack": settings.attack, "shared": settings.attack.shared}
-    options |= {"scene": scene, "renderer": settings.renderer, "device": device}
-    options["rasterizer"] = choose_rasterizer(settings.renderer)
+    options: dict[str, Any] = {"scene": scene, "device": choose_device(settings.device)}
+    options |= {"attack": settings.attack, "shared": settings.attack.shared}
+    options |= {"renderer": settings.renderer, "rasterizer": choose_rasterizer(settings.renderer)}
     with keyed("scene", **keys_of("scene", scene)):
         return build_scene([item], size, scene.views, **options)
 
@@ -280,9 +271,7 @@ def _labeled(settings: AttackExperimentSettings, classes: Sequence[str]) -> list
     return [*meshes.values()]
 
 
-def load_targets(
-    settings: AttackExperimentSettings, attacked: Classifier, device: torch.device
-) -> dict[str, Sequence[Any]]:
+def load_targets(settings: AttackExperimentSettings, attacked: Classifier) -> dict[str, Any]:
     """Load the other classifiers and meshes with which successful attacks are tested.
 
     Return the arguments of `nb.transfer`.
@@ -303,7 +292,7 @@ def load_targets(
         # `label` raises an InputError if the classifier lacks the class.
         for mesh in _labeled(settings, attacked.classes):
             other.label(mesh.label)
-        classifiers.append(other.to(device))
+        classifiers.append(other.to(choose_device(settings.device)))
     objects = []
     for mesh in read_objects(chosen.meshes, label, "transfer.meshes").values():
         # A mesh with a class that the attacked network lacks raises InputError.

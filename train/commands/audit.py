@@ -75,8 +75,6 @@ NO_PHOTOGRAPHS = (
     "photos shows no objects of other classes, and a hardened network may take similar objects on "
     "real photographs for the class, which renders do not show: give photographs of such objects."
 )
-# Settings of pnb-audit that name the folders of test images, by the name of the images.
-FOLDER_KEYS = {LABORATORY: "laboratory", PHOTOGRAPHS: "photos"}
 # When a stopped audit continues, these settings may be set if they were not set before.
 SETTABLE_LATER = ("hardened", "photos", "unlabeled")
 # The networks of an audit, by their keys CLASSIFIER and HARDENED.
@@ -204,11 +202,10 @@ def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page
     """
     is_named = networks is None
     device = choose_device(settings.device)
-    loaded = networks or {CLASSIFIER: load_chosen(settings)}
+    loaded = {**networks} if networks else {CLASSIFIER: load_chosen(settings)}
     if is_named and settings.hardened:
         with keyed(name="hardened"):
-            hardened = load_network(settings.hardened, trust_code=settings.trust)
-        loaded = {**loaded, HARDENED: hardened}
+            loaded[HARDENED] = load_network(settings.hardened, trust_code=settings.trust)
     networks = {key: network.to(device) for key, network in loaded.items()}
     # Without meshes, only photographs are attacked, and there is no plan.
     plan, given = None, settings
@@ -246,7 +243,7 @@ def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page
         console.warning(sentence)
     described = [f"Images of {one.name}: {one.describe_inputs()}." for one in networks.values()]
     caveats = [*described, *caveats]
-    with sole_writer("out", out):
+    with sole_writer(out):
         _prepare_folder(settings, out, renders, networks)
         for key in networks:
             (out / key).mkdir(exist_ok=True)
@@ -256,8 +253,7 @@ def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page
             names[HARDENED] += " (hardened)"
         # Without meshes, the page is about photographs, and has no label.
         label = settings.label if plan else ""
-        remedies = audited.name_remedies(networks)
-        write_page = partial(page.write_audit_page, label, names, remedies)
+        write_page = partial(page.write_audit_page, label, names, audited.name_remedies(networks))
         for missing, folders in plan.measure(networks, out, settings) if plan else ():
             path = write_page(folders, out, caveats, missing).path
             # A caller from Python gets the complete page.
@@ -365,13 +361,14 @@ class _Plan:
             for name in labels:
                 network.label(name)
             for name, folder in self.image_folders.items():
-                with keyed(FOLDER_KEYS[name]):
+                with keyed("photos" if name == PHOTOGRAPHS else "laboratory"):
                     found = find_photographs(folder, network.classes, self.label)
                 if name == PHOTOGRAPHS:
                     self.has_other_photographs = bool({item.label for item in found} - {self.label})
         # Hard negatives and lights are loaded only to report a file that cannot be read
         # before the audit begins.
-        objects = [load_object(item) for item in self.items]
+        positives = [load_object(item) for item in meshes]
+        self.negatives = [load_object(item) for item in hard_negatives]
         for name in settings.environments:
             load_light(name)
         self.environments = [UNIFORM, *settings.environments]
@@ -384,13 +381,9 @@ class _Plan:
             fault = f"environments={settings.environments} must have different names"
             raise InputError(f"{fault}, and none of {others}: rename a file", "environments")
         self.random_light_count = settings.scale(RANDOM_LIGHT_COUNT)
-        positives = objects[: len(meshes)]
-        self.negatives = objects[len(meshes) :]
         # Most views are only shown in other light, and few are attacked, since this takes longer.
-        self.views, self.attacked_views = (
-            lights.Views(positives, settings.scale(count), settings.seed, device)
-            for count in (VIEW_COUNT, ATTACKED_COUNT)
-        )
+        self.views = lights.Views(positives, settings.scale(VIEW_COUNT), settings.seed, device)
+        self.attacked_views = replace(self.views, count=settings.scale(ATTACKED_COUNT))
 
     def measured_folders(self) -> dict[str, Path]:
         """Return the folders of test images on which `measure` has scored the networks by now."""
@@ -408,10 +401,8 @@ class _Plan:
         path = out / CLASSIFIER / lights.PLAIN
         _write_json(path, lights.find_plain_views, networks[CLASSIFIER], self.attacked_views)
         plain = lights.PlainViews(**read_json(path))
-        views, attacked_views = (
-            replace(views, light=plain.light, exposure=plain.exposure, size=plain.size)
-            for views in (self.views, self.attacked_views)
-        )
+        views = replace(self.views, light=plain.light, exposure=plain.exposure, size=plain.size)
+        attacked_views = replace(views, count=self.attacked_views.count)
         unusual = lights.environment_lights(views, self.environments, self.random_light_count)
         # Attacks within the largest radius, which go on with smaller radii, by the path of both.
         attacks: dict[Path, Iterator[dict[str, Any]]] = {}
@@ -428,8 +419,7 @@ class _Plan:
         to_render = self.image_folders.keys() - self.measured_folders().keys()
         later = [IN_WORDS[name] for name in to_render]
         if attacks:
-            missing = " and ".join(["attacks within smaller radii", *later])
-            yield missing, self.measured_folders()
+            yield " and ".join(["attacks within smaller radii", *later]), self.measured_folders()
         for path, counts in attacks.items():
             _write_json(path, lambda counts=counts: [*counts][-1])
             path.with_name(path.stem + lights.FIRST).unlink()
@@ -481,13 +471,11 @@ def complete(settings: AuditSettings, classes: Sequence[str]) -> AuditSettings:
         # Solids of the class itself are no negatives.
         names = [one for one in NEGATIVE_SOLIDS if class_names.class_of_name(one, [label]) is None]
         negatives = [f"solid:{name}" for name in names]
-    items: dict[str, Any] = {
-        key: [class_names.with_class_name(item, classes, key) for item in given]
-        for key, given in (("meshes", settings.meshes), ("hard_negatives", negatives))
-    }
-    others = read_objects(items["hard_negatives"], "", "hard_negatives")
+    meshes = class_names.with_class_name(settings.meshes, classes, "meshes")
+    negatives = class_names.with_class_name(negatives, classes, "hard_negatives")
+    others = read_objects(negatives, "", "hard_negatives")
     class_names.require_others(others, [label], classes)
-    return replace(settings, label=label, **items)
+    return replace(settings, label=label, meshes=meshes, hard_negatives=negatives)
 
 
 def _prepare_folder(settings: AuditSettings, out: Path, renders: Path, networks: Networks) -> None:
@@ -523,13 +511,12 @@ def _write_renders(settings: AuditSettings, plan: _Plan, size: Size, out: Path) 
     They show the meshes and the hard negatives under each pattern of PATTERNS,
     and in each environment map of the audit.
     """
-    # Each lighting gets the same number of setups.
-    lighting_count = len(PATTERNS) + len(settings.environments)
     lab_settings = LabSettings(
         out=str(out),
         label=settings.label,
         meshes=[asdict(item) for item in plan.items],
-        setups=settings.scale(SETUPS) * lighting_count,
+        # Each lighting gets the same number of setups.
+        setups=settings.scale(SETUPS) * (len(PATTERNS) + len(settings.environments)),
         patterns=[*PATTERNS],
         environments=settings.environments,
         size=size,

@@ -165,7 +165,7 @@ def evaluate(
         280
     """
     # `calibrate` and `false_positive_rate` belong together.
-    require_calibration(false_positive_rate, None if calibrate is None else str(calibrate))
+    require_calibration(false_positive_rate, calibrate)
     require_choice("fit", fit, FITS)
     folder = published_folder(as_path("photos", photos))
     device = device_of(network) if device is None else torch.device(device)
@@ -186,9 +186,8 @@ def evaluate(
         target = None
         if out is not None:
             target = output_folder(str(out), overwrite)
-            if folder.is_dir():
-                require_outside(target, folder)
-        with sole_writer("out", target) if target else nullcontext():
+            require_outside(target, folder)
+        with sole_writer(target) if target else nullcontext():
             if not isinstance(made, Classifier):
                 found: AnnotatedScores
                 how = Showing(fit, skip_unreadable, device)
@@ -206,8 +205,7 @@ def evaluate(
             stored = {point.label: point for point in made.operating_points}
             points = [stored[name] for name in labels] if stored.keys() >= set(labels) else []
             if stored and not points and calibrate is None:
-                names = ", ".join(stored)
-                say_once(f"the stored thresholds are not used: set label={names}")
+                say_once(f"the stored thresholds are not used: set label={', '.join(stored)}")
             if calibrate is not None and false_positive_rate is not None:
                 chosen_on = Path(calibrate), labels, false_positive_rate, skip_unreadable
                 points = scoring.choose_operating_points(predictor, *chosen_on)

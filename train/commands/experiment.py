@@ -22,10 +22,10 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from augment import distributed
 from renderer.errors import InputError, keyed
@@ -46,9 +46,6 @@ from train.system import NO_ROOM, is_verbose, program, shortened, user_message
 from train.training.inputs import load_inputs, with_label
 from train.training.run import Run
 
-# An override such as experiment=photographs chooses a file of settings. These keys
-# are the folders of such files in conf/.
-CHOICES = ("experiment", "augment", "data", "launcher")
 # Name of the log file in the folder of a training run.
 LOG = "train.log"
 # The first training on photographs takes these settings from the main training.
@@ -73,30 +70,28 @@ def train(config: DictConfig, overrides: Sequence[str]) -> None:
         # A resumed run keeps its recorded settings, except for single values that the
         # overrides change. A choice of a whole file, or of photographs_first, prevents this.
         keys = [override.partition("=")[0] for override in overrides]
-        is_whole = config.photographs_first or any(key in CHOICES or "@" in key for key in keys)
+        is_whole = config.photographs_first or any(key in main.groups or "@" in key for key in keys)
         if config.train.resume and not is_whole:
             config, command = resume_config(config, overrides)
         settings = with_label(read_settings(ExperimentSettings, config))
         if settings.photographs_first:
-            settings = _train_on_photographs(settings, folder, command)
+            settings = _train_on_photographs(settings, command)
         _train_in(folder, settings, command, folder)
 
 
-def _train_on_photographs(
-    settings: ExperimentSettings, folder: Path, command: str
-) -> ExperimentSettings:
+def _train_on_photographs(settings: ExperimentSettings, command: str) -> ExperimentSettings:
     """Train on photographs first, as the setting `photographs_first` asks.
 
     If this first training is already finished, it is not repeated. The returned settings are those
     of the main training, which starts from the network of the first.
     """
+    folder = Path(settings.out)
     first = folder / PHOTOGRAPHS_FIRST
     values = asdict(settings)
-    changes = {name: values[name] for name in SHARED}
-    changes["out"] = str(first)
+    changes = {name: values[name] for name in SHARED} | {"out": str(first)}
     changes["train"] = {name: values["train"][name] for name in SHARED_IN_TRAIN}
-    config = OmegaConf.merge(main.compose(["experiment=photographs"]), changes)
-    on_photographs = read_settings(ExperimentSettings, cast(DictConfig, config))
+    config = main.compose(["experiment=photographs"])
+    on_photographs = read_settings(ExperimentSettings, config, changes)
     if settings.train.resume and is_finished(first):
         require_same_run(first, on_photographs, done=True)
     else:
@@ -129,7 +124,7 @@ def _train_in(folder: Path, settings: ExperimentSettings, command: str, out: Pat
     with ExitStack() as first_process:
         if distributed.rank() == 0:
             first_process.enter_context(logged_to(writable_folder(folder, "out") / LOG))
-            first_process.enter_context(sole_writer("out", *settings_of_runs))
+            first_process.enter_context(sole_writer(*settings_of_runs))
         try:
             data, initial = load_inputs(next(iter(settings_of_runs.values())))
             # All mistakes are reported before the first run is trained.
@@ -215,12 +210,10 @@ def sweep(
         raise InputError("photographs_first=true makes no sweep: start the runs one by one")
     if first_config.compare:
         raise InputError(f"compare={first_config.compare} makes no sweep: give augment=none,random")
-    overwrite = bool(first_config.overwrite)
     parent = writable_folder(str(first_config.sweep), "sweep")
     # An earlier report about the same sweep may be replaced.
-    require_replaceable(parent, "sweep", overwrite, own=[PAGE])
-    shared = set.intersection(*map(set, runs))
-    shared_keys = [override.partition("=")[0] for override in shared]
+    require_replaceable(parent, "sweep", first_config.overwrite, own=[PAGE])
+    shared_keys = [word.partition("=")[0] for word in set.intersection(*map(set, runs))]
     folders = [parent / run_name(overrides, shared_keys, str(parent)) for overrides in runs]
     if len(set(folders)) < len(runs):
         raise InputError("the sweep has two runs with the same settings: give each value once")
@@ -231,7 +224,7 @@ def sweep(
         if is_finished(folder) or checkpoints.exists(folder):
             require_same_run(folder, settings, done=True)
         else:
-            require_new_run(folder, "sweep", overwrite, resume=True)
+            require_new_run(folder, "sweep", settings.overwrite, resume=True)
             texts = [word for word in overrides if not re.search(r"=[-+.e\d]+$", word)]
             new_runs.setdefault(frozenset(texts), (folder, settings))
     # Numbers are checked now. The files and networks that texts name are checked by loading them.
@@ -280,9 +273,8 @@ def _run(config: DictConfig, folder: Path) -> None:
         try:
             settings = with_label(read_settings(ExperimentSettings, config))
             settings.train.resume = checkpoints.exists(folder)
-            command = format_command(job.overrides.task)
             data, initial = load_inputs(settings)
-            run = Run(settings, data, folder, initial, command)
+            run = Run(settings, data, folder, initial, format_command(job.overrides.task))
             run.begin()
             run.train()
         except Exception as error:

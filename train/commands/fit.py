@@ -77,7 +77,7 @@ def run(settings: FitSettings) -> None:
     save_light(out / "light.json", fitted.scene.light)
     # The result is checked in the picture that pnb-attack will render from the written files.
     scene, renderer = attacked_scene(settings, fitted.scene.camera, out)
-    photograph, rendered = render_attacked(settings, scene, renderer)
+    photograph, rendered = render_attacked(mesh_settings, scene, renderer)
     write_image(out / "comparison.png", torch.cat([photograph, rendered], dim=2))
     # The three channels of the mask are equal, so the first one is enough.
     is_object = read_image(out / "mask.png", ATTACKED_SIZE)[0] > MIN_COVERAGE
@@ -125,14 +125,13 @@ def attacked_scene(
 
 
 def render_attacked(
-    settings: FitSettings, scene: Mapping[str, Any], renderer: Mapping[str, Any]
+    mesh: ObjectSettings, scene: Mapping[str, Any], renderer: Mapping[str, Any]
 ) -> tuple[Float[torch.Tensor, "3 size size"], Float[torch.Tensor, "3 size size"]]:
     """Return the encoded background, and the render as it is before an attack by pnb-attack."""
     rendered = RendererSettings(**{"shadows": True, **renderer})
-    attacked = AttackExperimentSettings(scene=AttackSceneSettings(**scene), renderer=rendered)
-    label = settings.label or ""
-    mesh = ObjectSettings(settings.mesh, label=label, albedo_scale=settings.albedo_scale)
-    shown = build_attacked(attacked, mesh, attacked.scene, ATTACKED_SIZE, torch.device("cpu"))
+    chosen = AttackSceneSettings(**scene)
+    attacked = AttackExperimentSettings(scene=chosen, renderer=rendered, device="cpu")
+    shown = build_attacked(attacked, mesh, chosen, ATTACKED_SIZE)
     first_example = torch.arange(1)
     # The render has one example and one view, shape (1, 1, 3, size, size).
     return shown.backgrounds[0], shown.render(shown.conditions(first_example), first_example)[0, 0]

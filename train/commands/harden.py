@@ -3,12 +3,11 @@
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from copy import deepcopy
-from dataclasses import asdict, fields
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, cast
 
 import torch
-from omegaconf import OmegaConf
 from torch import Tensor, nn
 
 from augment.augmentation_settings import AugmentationSettings
@@ -170,9 +169,7 @@ def harden(
         changes: dict[str, Any] = {"seed": seed, "overwrite": overwrite, "meshes": items}
         changes |= {"network": classifier.name, "unlabeled": str(as_path("unlabeled", unlabeled))}
         changes |= {"data": {"name": "unlabeled"}, "train": {"device": str(device)}}
-        changes["out"] = str(folder.absolute())
-        if label is not None:
-            changes["label"] = label
+        changes |= {"out": str(folder.absolute()), "label": label}
         if is_detector:
             require_losses(classifier, bool(meshes))
             if not meshes:
@@ -182,10 +179,9 @@ def harden(
         if out is None:
             # Nothing is written outside of the temporary folder.
             changes["train"]["cache"] = None
-        experiment = "detector" if is_detector else "classifier"
         sections: dict[str, Any] = {"train": train, "augment": augment, "scene": scene}
         sections |= {"renderer": renderer, "data": data}
-        settings = _read_settings(experiment, changes, sections)
+        settings = _read_settings("detector" if is_detector else "classifier", changes, sections)
         if settings.train.recognize and not isinstance(network, TaskNetwork):
             fault = "train.recognize=true needs a network that keeps what recognizes the light"
             raise InputError(f"{fault}: give an nb.Classifier instead", "train.recognize")
@@ -199,7 +195,7 @@ def harden(
         if meshes or label is not None:
             settings = class_names.with_class_names(settings, classifier.classes)
         # Training changes threads, random generators and cuDNN's choices, which are restored.
-        with sole_writer("out", folder), ExitStack() as at_end, torch.random.fork_rng():
+        with sole_writer(folder), ExitStack() as at_end, torch.random.fork_rng():
             cudnn = torch.backends.cudnn
             at_end.callback(torch.set_num_threads, torch.get_num_threads())
             at_end.callback(setattr, cudnn, "benchmark", cudnn.benchmark)
@@ -244,14 +240,12 @@ def _read_settings(
     `sections`, which the caller gave, win over `changes`, and these win over the experiment.
     """
     config = main.compose([f"experiment={experiment}"])
-    # The configuration without keys that belong to the command alone.
-    settings = OmegaConf.masked_copy(config, [item.name for item in fields(ExperimentSettings)])
     # `harden` returns only the network, so scores on test renders are not needed.
-    settings.evaluate.laboratory_setups = 0
+    config.evaluate.laboratory_setups = 0
     given = {}
     for name, section in sections.items():
         values = asdict(cast(Any, section)) if isinstance(section, Settings) else section or {}
         if not isinstance(values, Mapping):
             raise InputError(f"{name} is {describe(section)}: give a mapping, or settings")
         given[name] = values
-    return read_settings(ExperimentSettings, settings, changes, given)
+    return read_settings(ExperimentSettings, config, changes, given)

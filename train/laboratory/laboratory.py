@@ -376,7 +376,7 @@ def write_laboratory(settings: LabSettings) -> int:
     slides = [picture.permute(1, 2, 0).numpy() for picture in pictures]
     # A shot, or setup, is a random lighting, camera and pose in which objects are rendered.
     shots = draw_shots(settings, environments, slides)
-    with sole_writer("out", out):
+    with sole_writer(out):
         if settings.overwrite:
             # Only renders are removed, no other files. lab.json says that they are complete.
             for file in (out / DESCRIPTION, out / TABLE, *out.glob(RENDERS)):

@@ -1,4 +1,4 @@
-"""Averages of the weights of a network over the training, and the choice of the best network."""
+"""Averages of the weights of a network over the training, and interpolation between weights."""
 
 from collections.abc import Mapping
 from typing import Any, cast
@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn, get_swa_avg_fn
 
-from augment.network import compute_outputs
+from augment.network import compute_outputs, device_of
 from augment.progress import progress
 from augment.random_streams import stream_seed
 from train import console
@@ -55,13 +55,13 @@ class MovingAverage(AveragedModel):
         for is_floating in (True, False):
             chosen = [pair for pair in pairs if pair[0].is_floating_point() == is_floating]
             if chosen:
-                old = [average.detach() for average, _ in chosen]
-                self._average(old, [value.detach() for _, value in chosen], None)
+                old, new = zip(*chosen, strict=True)
+                self._average(old, new, None)
         self.n_averaged += 1
 
 
 class Averages:
-    """Averages of a network in training, and the choice of the network that the training keeps.
+    """Averages of a network in training.
 
     There are two averages, and both are optional: an exponential moving average of the weights
     over the steps, and a model soup, the mean of the weights after each epoch (Wortsman et al.
@@ -72,19 +72,16 @@ class Averages:
             else the network in training.
     """
 
-    def __init__(self, model: MixedPrecision, decay: float, soup: bool, keeps_latest: bool = False):
+    def __init__(self, model: MixedPrecision, decay: float, soup: bool):
         """Create the averages, which are empty at first.
 
-        `decay` is that of a step, or 0 for no moving average. With `keeps_latest` or a
-        soup, the last network is kept instead of the one with the highest validation accuracy.
+        `decay` is that of a step, or 0 for no moving average.
         """
         self._model = model
         self._ema = MovingAverage(model, decay) if decay else None
         # The function updates the equal-weight mean of all networks so far, as for SWA.
         mean = get_swa_avg_fn()
         self._soup = AveragedModel(model, avg_fn=mean, use_buffers=True) if soup else None
-        self._keeps_latest = soup or keeps_latest
-        self._best_accuracy = -1.0
         average = self._soup or self._ema
         self.selected = cast(MixedPrecision, average.module) if average else model
 
@@ -111,12 +108,6 @@ class Averages:
         if self._soup:
             self._soup.update_parameters(self._ema.module if self._ema else self._model)
 
-    def is_kept(self, accuracy: float) -> bool:
-        """Return whether to keep the network of this epoch instead of that of an earlier epoch."""
-        is_best = accuracy > self._best_accuracy
-        self._best_accuracy = max(accuracy, self._best_accuracy)
-        return is_best or self._keeps_latest
-
     def weights(self) -> dict[str, torch.Tensor]:
         """Return a copy of the weights of the selected network on the CPU, by name."""
         state = self.selected.network.state_dict()
@@ -128,13 +119,11 @@ class Averages:
         return {name: of.state_dict() if of else None for name, of in averages.items()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore the averages, and the best accuracy so far, from a checkpoint."""
+        """Restore the averages from a checkpoint."""
         if self._ema:
             self._ema.load_state_dict(state["ema"])
         if self._soup:
             self._soup.load_state_dict(state["soup"])
-        accuracies = [line["validation/accuracy"] for line in state["history"]]
-        self._best_accuracy = max(accuracies, default=-1.0)
 
 
 def interpolate(
@@ -160,7 +149,7 @@ def interpolate(
     """
     # Weights of the losses of unchanged and of relit images.
     weights = (recipe.distillation_weight or 1.0, recipe.consistency_weight)
-    device = next(initial.parameters()).device
+    device = device_of(initial)
     initial_weights = {name: value.cpu() for name, value in initial.network.state_dict().items()}
     targets = predict(initial, validation, device)
     # The loss at each factor: 0 gives the initial weights, and 1 the trained ones.

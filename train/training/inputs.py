@@ -23,7 +23,7 @@ from augment.switch import SWITCHES
 from augment.tasks.classification import Classification, class_index, complementary_label
 from augment.tasks.detection import Detection
 from augment.tasks.task import Task
-from renderer.errors import InputError, as_path, composed, is_whole, keyed, keys_of, require_range
+from renderer.errors import InputError, composed, is_whole, keyed, keys_of, require_range
 from renderer.settings import MAX_SIZE
 from train import checkpoints, console
 from train.class_names import class_of_name, name_of_mesh, require_others, with_class_names
@@ -32,14 +32,7 @@ from train.data.photographs import find_photographs, load_photographs
 from train.data.rendered_shapes import cache_folder, load_shapes
 from train.device import choose_rasterizer, main_process_first
 from train.networks import CLASSIFIER, describe
-from train.settings import (
-    MIN_SIZE,
-    OTHER,
-    UNLABELED,
-    ExperimentSettings,
-    label_names,
-    published_folder,
-)
+from train.settings import MIN_SIZE, OTHER, UNLABELED, ExperimentSettings, published_folder
 
 # Default fraction of the training images that validate the network.
 VALIDATION = 0.1
@@ -101,13 +94,12 @@ class Initial:
 
         Networks that differ in classes, image size or architecture raise InputError.
         """
-        for key in ("classes", "size"):
-            if self.architecture[key] != description[key]:
-                fault = f"network={self.source} has another {key}"
-                if key == "size":
-                    own, of_data = self.architecture[key], description[key]
-                    fault = f"network={self.source} takes {own} pixels, but the data has {of_data}"
-                raise InputError(f"{fault}: give the same {key}")
+        if self.architecture["classes"] != description["classes"]:
+            raise InputError(f"network={self.source} has other classes: give the same classes")
+        own, of_data = self.architecture["size"], description["size"]
+        if own != of_data:
+            fault = f"network={self.source} takes {own} pixels, but the data has {of_data}"
+            raise InputError(f"{fault}: give the same size")
         with checkpoints.checks_architecture(self.source):
             network.load_state_dict(self.weights)
 
@@ -119,14 +111,11 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
         return None
     if name.startswith(SWITCHES):
         raise InputError(f"network={name} has two networks: train one of them", "network")
-    # A classifier comes from a library or a file. Any other name is the folder of a training run.
-    if checkpoints.is_classifier(name):
+    # A classifier comes from a library or a file, and a file of weights alone is refused like it.
+    # Any other name is the folder of a training run.
+    if checkpoints.is_classifier(name) or checkpoints.lacks_architecture(Path(name)):
         return _load_classifier(settings, name)
     source = Path(name.removeprefix(checkpoints.RUN))
-    # A file of weights alone does not say which network they belong to.
-    if checkpoints.is_state_dict(source):
-        advice = f"give both, as in network=torchvision:resnet50 weights={source}"
-        raise InputError(f"network={name} has weights, but no architecture: {advice}", "network")
     if settings.weights is not None:
         raise InputError(f"weights: network={name} has its own: leave weights out", "weights")
     # The network of a run has its own classes and its own normalization.
@@ -134,14 +123,14 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
     require_no_facts(f"network={name}", stated_facts)
     with keyed(run="network"):
         path, state = checkpoints.load_selected(source)
+    architecture = state["architecture"]
     # A run of a network that a Python function built names this function. To call it means to run
     # code, which the user must allow.
-    built_by = str(state["architecture"].get("name"))
+    built_by = str(architecture.get("name"))
     is_named = split_function(settings.model.name) == split_function(built_by)
     if built_by.startswith(PYTHON) and not is_named and not settings.trust:
         advice = f"give model.name={built_by} to run that code"
         raise InputError(f"the network in {path} is built by {built_by}: {advice}", "network")
-    architecture = state["architecture"]
     # Who stated size and normalization of the network: its file, or nobody.
     stated = checkpoints.stated_inputs(architecture)
     return Initial(path, architecture, checkpoints.plain_weights(state), inputs=stated)
@@ -154,7 +143,7 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
     of the meshes. The names of the classes are known from the initial network. Without one, the
     settings stay.
     """
-    names = [] if settings.label is None else label_names(settings.label)
+    names = settings.labels
     if len(names) == 1 and settings.augment.renders:
         files = [item for item in settings.meshes if isinstance(item, str)]
         others = [file for file in files if class_of_name(name_of_mesh(file), names) is None]
@@ -162,7 +151,13 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
             console.warning("label=%s is the class of %s", names[0], ", ".join(others))
     # A number can be the index of a class.
     may_have_index = any(name.isdecimal() for name in names)
-    if not (may_have_index or settings.label_follows_from_meshes):
+    # Without a label, the run must train on objects of the positive classes, or score images of
+    # them: the list of the classes of the meshes is the label then.
+    is_scored = bool(settings.photos) or settings.evaluate.laboratory_setups > 0
+    is_used = settings.augment.renders or settings.train.ranking_weight > 0 or is_scored
+    has_meshes = bool(settings.meshes) and settings.augment.mode != "folder"
+    follows_from_meshes = settings.label is None and has_meshes and is_used
+    if not (may_have_index or follows_from_meshes):
         return settings
     initial = load_initial(settings)
     # Without an initial network, `Run` checks the label when it knows the classes of the data.
@@ -171,13 +166,12 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
 
 def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
     """Load a classifier, from another library or from a file, as the initial network."""
-    size = settings.size
-    with keyed(name="network", size="size"):
+    with keyed(name="network"):
         # A file may not record the size of its images, so it gets the size of the settings.
         # Any other classifier has a size of its own.
-        given_size = size if is_network_file(name) else None
+        given_size = settings.size if is_network_file(name) else None
         facts = NetworkFacts(settings.classes, given_size, settings.normalization, settings.prompt)
-        weights = None if settings.weights is None else as_path("weights", settings.weights)
+        weights = Path(settings.weights) if settings.weights else None
         classifier = load_source(name, weights, facts, settings.trust)
     if not isinstance(classifier.task, Classification):
         fault = f"network={name} is no classifier, but for {classifier.task.name}"
@@ -188,7 +182,7 @@ def _load_classifier(settings: ExperimentSettings, name: str) -> Initial:
         advice = "give a file of TorchScript or torch.export"
         raise InputError(f"network={name} has no weights to train: {advice}", "network")
     # A run builds the network again, since modules of TorchScript cannot be copied.
-    return replace(initial_of(classifier, size), source=Path(name), network=None)
+    return replace(initial_of(classifier, settings.size), source=Path(name), network=None)
 
 
 def initial_of(classifier: TaskNetwork, size: int | None) -> Initial:
@@ -230,14 +224,12 @@ def choose_validation(
     # was trained on rendered images records the entry "data".
     record = {"fraction": asked or default, "seed": 0, "images": data.train.content_hash}
     record |= {"data": "shapes"} if data.rendered else {}
-    stored = initial.architecture.get("validation") if initial else None
-    earlier = stored if isinstance(stored, dict) else {}
-    left_out: Any = earlier.get("fraction")
-    is_of_other_kind = data.rendered and left_out is not None and "data" not in earlier
-    if initial is None or is_of_other_kind:
+    earlier: Any = (initial.architecture.get("validation") if initial else None) or {}
+    left_out = earlier.get("fraction")
+    if initial is None or (data.rendered and earlier and "data" not in earlier):
         return asked or default, record
     # The records of the same images differ only in the fraction.
-    is_known = isinstance(left_out, float) and record | {"fraction": left_out} == earlier
+    is_known = record | {"fraction": left_out} == earlier
     fraction: float = asked or (left_out if is_known else default)
     if not is_known or fraction > left_out:
         console.debug("validation: %s may have learned from these images", settings.network)
@@ -289,7 +281,7 @@ def require_label(settings: ExperimentSettings, data: sets.DataSet) -> None:
     if settings.label is None and (settings.augment.renders or settings.train.ranking_weight > 0):
         advice = f"give a class of the meshes, such as {', '.join(data.classes[:5])}"
         raise InputError(f"label is not set: {advice}", "label")
-    for label in () if settings.label is None else label_names(settings.label):
+    for label in settings.labels:
         name = data.classes[class_index(data.classes, label, "label")]
         if name != label and settings.scored_folders:
             raise InputError(f"label={label} is an index: give the name, label={name}", "label")
@@ -341,13 +333,10 @@ def build_service(
     images: Tensor | None = None
     labels = torch.zeros(0, dtype=torch.int64)
     phases = Phases(device)
-    names = [] if settings.label is None else label_names(settings.label)
     # The ranking loss compares images of a positive class with images of other classes. It
     # needs both.
-    is_ranked = is_classifier and (bool(settings.hard_negatives) or len(names) > 1)
-    positive_classes: list[int] = []
-    if is_ranked or settings.augment.renders:
-        positive_classes = [class_index(data.classes, name, "label") for name in names]
+    is_ranked = is_classifier and (bool(settings.hard_negatives) or len(settings.labels) > 1)
+    positive_classes = [class_index(data.classes, name, "label") for name in settings.labels]
     if settings.augment.renders and settings.augment.mode == "folder":
         images, labels = load_renders(settings, data, positive_classes)
         images = images.to(device)

@@ -17,7 +17,7 @@ from typing import Any, cast
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float
-from torch import Tensor, nn
+from torch import Tensor, cuda, nn
 
 from augment import distributed
 from augment.network import compute_outputs, device_of, eval_mode
@@ -29,7 +29,7 @@ from augment.tasks.detection import Detection
 from renderer.errors import InputError, explained, keyed, require_memory
 from renderer.image import to_bytes, to_unit
 from train import checkpoints, console, run_folder
-from train.data.batches import Batch, Round, round_size, rounds_of_epoch, training_batches
+from train.data.batches import Batch, round_size, rounds_of_epoch, training_batches
 from train.data.sets import Split
 from train.device import MixedPrecision, SignalHandler, all_reduce_sum, compiles, wrap_ddp
 from train.settings import TrainSettings
@@ -97,7 +97,7 @@ class TrainingStep:
     def __post_init__(self) -> None:
         """Build the optimizer, the loss and the augmentation."""
         settings, model, teacher, service = self.settings, self.model, self.teacher, self.service
-        device = next(model.parameters()).device
+        device = device_of(model)
         # `wrap_ddp` may replace layers of the network. The optimizer is built
         # afterwards, so that it has the parameters of the new layers.
         replica = wrap_ddp(model, None if isinstance(service.task, Detection) else self.size)
@@ -111,7 +111,6 @@ class TrainingStep:
             is_compiled = compiles(settings.compile, device)
         self._loss: Callable[..., tuple[Tensor, Tensor]]
         if isinstance(service.task, Detection):
-            is_compiled = False
             self._loss = DetectionLoss(replica, settings, teacher, service.task).compute
         else:
             if settings.augmentation == "pgd" and not self.labeled:
@@ -123,11 +122,11 @@ class TrainingStep:
                 # The teacher takes the features from the network in training, if they are equal.
                 loss.teacher = recipe.share_layers(settings, model, teacher, self.size)
             self._loss = loss.compute
-        if is_compiled:
-            # torch limits the number of compiled functions in a process. Those of an
-            # earlier run are removed.
-            torch.compiler.reset()
-            self._loss = torch.compile(self._loss, mode="reduce-overhead", dynamic=False)
+            if is_compiled:
+                # torch limits the number of compiled functions in a process. Those of an
+                # earlier run are removed.
+                torch.compiler.reset()
+                self._loss = torch.compile(self._loss, mode="reduce-overhead", dynamic=False)
 
     def take(self, batch: Batch, done: float, number: int) -> Float[Tensor, " 2"]:
         """Change the weights by the gradient of the loss of a batch.
@@ -224,11 +223,9 @@ class Trainer:
         # Time of the last checkpoint or, before that, of the start; and seconds that it took.
         self._saved_at, self._saving_took = time.perf_counter(), 0.0
 
-        self.device = next(model.parameters()).device
+        self.device = device_of(model)
         self.initial = deepcopy(model).eval().requires_grad_(False) if self.has_initial else None
-        # The validation accuracy of data without labels is the agreement with the initial
-        # network. It is highest before any training, and cannot choose an epoch.
-        self.averages = Averages(model, settings.ema_decay, settings.soup, not self.labeled)
+        self.averages = Averages(model, settings.ema_decay, settings.soup)
         self.selected = self.averages.selected
         has_teacher = settings.distillation_weight or settings.consistency_weight
         teacher = self.initial if has_teacher else None
@@ -255,7 +252,7 @@ class Trainer:
                 is_stopping = signals.requested()
                 is_last = self.epoch == self.settings.epochs
                 is_due = self.epoch % self.settings.checkpoint_every == 0
-                if is_stopping or is_last or (is_due and self._epoch_state is None):
+                if is_stopping or is_last or is_due:
                     self._save()
                 if is_stopping:
                     signals.stop()
@@ -273,10 +270,12 @@ class Trainer:
         steps = [math.ceil(len(one.rows) / settings.batch_size) for one in rounds]
         if self._epoch_state:
             # A resumed run continues within an epoch, with the random numbers of the first attempt.
-            checkpoints.restore_random_state(self._random_state)
+            torch.set_rng_state(self._random_state["cpu"])
+            # Surplus states or GPUs are ignored.
+            cuda.set_rng_state_all(self._random_state["cuda"][: cuda.device_count()])
         else:
             self.averages.begin_epoch(self.initial, self.step.optimizer)
-            renders = self._regenerate(rounds[0])
+            renders = self._regenerate(rounds[0].number)
             sums = torch.zeros(2, device=self.device)
             self._epoch_state = EpochState(renders, sums, [renders.diagnostics])
         state = self._epoch_state
@@ -284,7 +283,7 @@ class Trainer:
         begun = len(state.diagnostics)
         for index, now in [*enumerate(rounds)][begun - 1 :]:
             if index >= begun:
-                state.renders = self._regenerate(now)
+                state.renders = self._regenerate(now.number)
                 state.diagnostics.append(state.renders.diagnostics)
             title = f"epoch {self.epoch + 1}"
             if len(rounds) > 1:
@@ -303,8 +302,7 @@ class Trainer:
                     # Each epoch of a soup runs through the whole schedule of the learning rate.
                     if not settings.soup:
                         done = (self.epoch + done) / settings.epochs
-                    number = self.epoch * sum(steps) + state.step
-                    state.sums += self.step.take(batch, done, number)
+                    state.sums += self.step.take(batch, done, self.epoch * sum(steps) + state.step)
                     self.averages.end_step()
                     state.step += 1
                     # After its last step, the epoch counts as trained, even if a signal came.
@@ -314,11 +312,11 @@ class Trainer:
                         self._save()
         return True
 
-    def _regenerate(self, now: Round) -> Renders:
+    def _regenerate(self, number: int) -> Renders:
         """Render the training renders of a round anew, and log images of a few attacks on them."""
-        torch.manual_seed(stream_seed(self.seed, now.number, "dropout"))
+        torch.manual_seed(stream_seed(self.seed, number, "dropout"))
         with self.phases("attack"):
-            renders = self.service.regenerate(self.model, now.number)
+            renders = self.service.regenerate(self.model, number)
         if renders.targets is not None:
             renders = replace(renders, labels=object_maps(renders.targets).to(self.device))
         if self._log and renders.attack_examples:
@@ -340,9 +338,11 @@ class Trainer:
         self.epoch += 1
         self._require_finite(loss_sum + validated["loss"], self.epoch)
         accuracy = validated["accuracy"]
-        # The network of this epoch replaces the selected network if it is better, or if the
-        # settings select the last network.
-        if self.averages.is_kept(accuracy):
+        # The network of this epoch replaces the selected network if it is better. The last network
+        # of a soup is selected, and that of data without labels, whose validation accuracy is the
+        # agreement with the initial network: it is highest before any training.
+        highest = max((line["validation/accuracy"] for line in self.history), default=-1.0)
+        if accuracy > highest or self.settings.soup or not self.labeled:
             self._best_is_new = True
             self.best = {"model": self.averages.weights(), **self._description()}
             self.best["validation_accuracy"] = accuracy
@@ -417,6 +417,7 @@ class Trainer:
 
         "under_way" is the epoch that has begun, or None between two epochs.
         """
+        states_of_gpus = cuda.get_rng_state_all() if cuda.is_available() else []
         return {
             **self._description(),
             "model": self.model.network.state_dict(),
@@ -424,7 +425,7 @@ class Trainer:
             **self.averages.state_dict(),
             "precision": self.model.precision,
             "service": self.service.state_dict(),
-            "random_state": checkpoints.random_state(),
+            "random_state": {"cpu": torch.get_rng_state(), "cuda": states_of_gpus},
             "under_way": self._epoch_state.state_dict() if self._epoch_state else None,
             "history": self.history,
         }
@@ -521,7 +522,6 @@ def fitting_batch_size(settings: TrainSettings, model: nn.Module, in_round: int,
 def activation_bytes(model: nn.Module, size: int) -> int:
     """Measure the memory that a training step keeps for each image until its backward pass."""
     totals = []
-    device = next(model.parameters()).device
     for count in (1, 2):
         kept: dict[int, int] = {}
 
@@ -532,7 +532,7 @@ def activation_bytes(model: nn.Module, size: int) -> int:
         hooks = torch.autograd.graph.saved_tensors_hooks(keep, lambda tensor: tensor)
         with eval_mode(model), torch.enable_grad(), hooks:
             # The result holds the kept tensors, whose addresses would otherwise be used again.
-            result = model(torch.full((count, 3, size, size), 0.5, device=device))
+            result = model(torch.full((count, 3, size, size), 0.5, device=device_of(model)))
         totals.append(sum(kept.values()))
         del result
     # The difference leaves out the weights, which all images share.

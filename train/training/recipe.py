@@ -243,8 +243,7 @@ class TrainingLoss:
     def learns_unchanged(self) -> bool:
         """Whether the network learns from images before the augmentation, too."""
         # Without labels, renders and distillation, only the augmented photographs are learned.
-        weight = self.settings.distillation_weight
-        return bool(self.labeled or self.positive_classes or weight)
+        return bool(self.labeled or self.positive_classes or self.settings.distillation_weight)
 
     def compute(
         self,
@@ -367,8 +366,7 @@ def share_layers(
         return teacher
     shared = SharedTeacher(pupil, teacher)
     # Two test images with a color gradient.
-    device = next(teacher.parameters()).device
-    images = torch.linspace(0, 1, 6 * size**2, device=device).view(2, 3, size, size)
+    images = torch.linspace(0, 1, 6 * size**2, device=device_of(teacher)).view(2, 3, size, size)
     with eval_mode(pupil), torch.no_grad():
         expected = teacher(images)
         is_equal = pupil(images).equal(expected) and shared.features is not None

@@ -72,9 +72,8 @@ def fit_recognizer(
         weights = logistic_weights(values, is_lit)
         scores = predict(measure, kept_aside, device).double() @ weights
     threshold = scores.quantile(KEPT, interpolation="higher").item()
-    percent = 100 * expected_errors(len(scores))
     message = "about %.0f%% of other images are recognized by mistake (threshold from %d images)"
-    console.info(message, percent, len(scores))
+    console.info(message, 100 * expected_errors(len(scores)), len(scores))
     return {"layers": layers, "weights": weights, "bias": -threshold}
 
 

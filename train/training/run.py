@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import torch
 from jaxtyping import Int
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from torch import Tensor, nn
 
 from augment import distributed, exposure
@@ -89,22 +89,20 @@ class Run:
             with keyed("photos"):
                 labels = photographs.choose_labels(scored, self.data.classes, settings.label)
                 photographs.find_photographs(scored, self.data.classes, labels)
-        # Settings of the run that is resumed. None for a new run.
-        earlier: DictConfig | None = None
+        # Settings of the run that is resumed. Empty for a new run.
+        earlier = OmegaConf.create({})
         if checkpoints.exists(folder):
             if settings.train.resume:
                 earlier = require_same_run(folder, settings)
             elif not settings.overwrite:
                 advice = "set train.resume=true or overwrite=true, or another folder"
                 raise InputError(f"out={folder} holds a run already: {advice}")
-        self._is_resumed = earlier is not None
+        self._is_resumed = bool(earlier)
         self._hashes = {"network": checkpoints.hash_weights(initial.weights)} if initial else {}
-        if earlier is not None:
-            names = {"network": f"network={settings.network}"}
-            require_same_weights(folder, self._hashes, names, earlier)
+        names = {"network": f"network={settings.network}"}
+        require_same_weights(folder, self._hashes, names, earlier)
         # The number of threads changes the last bits of the results, so a resumed run keeps it.
-        known = None if earlier is None else OmegaConf.select(earlier, "hardware.threads")
-        threads = settings.train.threads or known
+        threads = settings.train.threads or OmegaConf.select(earlier, "hardware.threads")
         fraction, record = inputs.choose_validation(settings, self.data, initial)
         with keyed(fraction="data.validation"):
             self.held_out = held_out_rows(self.data.train, fraction)
@@ -114,7 +112,7 @@ class Run:
                 recognizing_layers(self.trainer.model.network, self.data.size)
         # Number of CPU threads with which the run trains.
         self._threads = torch.get_num_threads()
-        if earlier is not None:
+        if self._is_resumed:
             self.trainer.resume()
             # The schedule extends over all epochs, but each epoch of a soup has the whole schedule.
             recipe = settings.train
@@ -155,11 +153,11 @@ class Run:
             light = light or initial.architecture.get(checkpoints.NORMALIZE_LIGHT)
         if light is not None:
             facts[checkpoints.NORMALIZE_LIGHT] = light
-            network = exposure.with_normalized_light(network, light)
+        wrapped = exposure.with_normalized_light(network, light)
         if recipe.freeze:
             with keyed(stage="train.freeze"):
                 freeze(wrappers.unwrapped(network), recipe.freeze, data.size)
-        model = place(network, recipe, data.size, threads)
+        model = place(wrapped, recipe, data.size, threads)
         device = wrappers.device_of(model)
         # By default, pretrained classifiers keep the statistics of their normalizations.
         if recipe.eval_mode is None:
@@ -169,8 +167,7 @@ class Run:
             console.info("learning rate %.3g, by the norm of the features of the network", rate)
             recipe = replace(recipe, learning_rate=rate)
         # The checkpoint describes the network without the wrapper, and the wrapper by its settings.
-        inner = exposure.without_normalized_light(network)
-        description = describe(inner, **facts, validation=validation)
+        description = describe(network, **facts, validation=validation)
         task = initial.task if initial else Classification()
         service = inputs.build_service(settings, data, device, task)
         options = description, service, self.folder, data.labeled, initial is not None
@@ -195,11 +192,10 @@ class Run:
             return
         # Without `overwrite`, only a run that stopped before its first checkpoint can have left
         # config.yaml here: `__init__` resumes or refuses a run with a checkpoint.
-        may_be_left = self.settings.overwrite or (self.folder / CONFIG).is_file()
         if self._is_resumed:
             # Folders that are no longer scored would keep the scores of an older network.
             remove(*self.folder.glob(f"*/{SUMMARY}"))
-        elif may_be_left:
+        elif self.settings.overwrite or (self.folder / CONFIG).is_file():
             remove_run(self.folder, with_others=not self.settings.train.resume)
         device, model = str(self.trainer.device), self.trainer.model
         hardware = {"device": device, "precision": model.precision, "threads": self._threads}
@@ -217,9 +213,9 @@ class Run:
         # Another run that was made in between may have set another number of threads.
         torch.set_num_threads(self._threads)
         trainer = self.trainer
-        is_first = distributed.rank() == 0
-        log = RunLog(self.folder, trainer.history, logger) if is_first else None
-        if is_first:
+        # Only the first process has a log.
+        log = RunLog(self.folder, trainer.history, logger) if distributed.rank() == 0 else None
+        if log:
             self._render_kept_aside()
         scores: dict[str, float] = {}
         if trainer.initial and not trainer.is_detector:
@@ -232,11 +228,11 @@ class Run:
             scores |= self._score()
             if self.settings.train.recognize and checkpoints.RECOGNIZER not in trainer.best:
                 self._recognize()
-        if log:  # Only the first process has a log.
+        if log:
             scores |= self._score_photographs(trainer.selected, self.folder)
             self._export()
             # A run with scores counts as finished.
-            log.scalars(scores)
+            log.scalars(scores, trainer.epoch + 1, is_final=True)
         return scores
 
     def _export(self) -> None:
@@ -250,8 +246,7 @@ class Run:
         path = self.folder / WEIGHTS
         # The weights have the names of the user's own network, without wrappers of this library.
         raw = wrappers.unwrapped(self.trainer.selected.network, own_alone=True)
-        weights = raw.state_dict()
-        checkpoints.save(path, {name: value.cpu() for name, value in weights.items()})
+        checkpoints.save(path, {name: value.cpu() for name, value in raw.state_dict().items()})
         console.info("network.load_state_dict(torch.load(%r)) loads the result", str(path))
         # Settings of the wrapper that normalizes the light of images. None without one.
         light = exposure.light_settings(self.trainer.selected.network)

@@ -53,7 +53,6 @@ class RunLog:
         """
         self._metrics = folder / METRICS
         self._renders = folder / RENDERS
-        self._epoch_count = len(history)
         atomic_write(self._metrics, "".join(json.dumps(line) + "\n" for line in history))
         remove_unfinished(self._renders)
         self._logger = logger
@@ -63,26 +62,23 @@ class RunLog:
             from torch.utils.tensorboard import SummaryWriter
 
             # Events after the checkpoint are removed, since the resumed run writes them again.
-            self._board = SummaryWriter(str(folder), purge_step=self._epoch_count + 1)
+            self._board = SummaryWriter(str(folder), purge_step=len(history) + 1)
 
-    def scalars(self, values: Numbers, epoch: int | None = None) -> None:
+    def scalars(self, values: Numbers, step: int, is_final: bool = False) -> None:
         """Write the metrics of an epoch, or the final scores, to the log.
 
-        `epoch` counts from 1, and is None for the final scores, after which nothing is logged.
+        `step` is the epoch, which counts from 1. The final scores, after which nothing is logged,
+        have the step after the last epoch.
         """
-        line = values if epoch is None else {"epoch": epoch, **values}
+        line = values if is_final else {"epoch": step, **values}
         with open(self._metrics, "a") as file:
             file.write(json.dumps(line) + "\n")
-        if epoch is not None:
-            self._epoch_count = epoch
-        # The final scores have the step after the last epoch.
-        step = epoch or self._epoch_count + 1
         if self._logger is not None:
             self._logger.log(dict(values), step=step)
             return
         for name, value in values.items():
             self._board.add_scalar(name, value, step)
-        if epoch is None:
+        if is_final:
             self._board.close()
         else:
             self._board.flush()

@@ -21,7 +21,7 @@ from train.commands.attack import attacks
 
 def configured(*arguments: str) -> AttackExperimentSettings:
     small = ["renderer.rasterizer=numpy", "renderer.shadows=false", "attack.max_steps=8"]
-    return read_quickly(attack_command, [*small, "attack.margin=0"], arguments)
+    return read_quickly(attack_command, [*small, "attack.margin=0", "device=cpu"], arguments)
 
 
 def by_color(classes: tuple[str, ...] = ("orange", "lime", "sky")) -> Classifier:
@@ -30,7 +30,7 @@ def by_color(classes: tuple[str, ...] = ("orange", "lime", "sky")) -> Classifier
 
 def attacked(*arguments: str, classifier: Classifier | None = None) -> AttackResult:
     settings = configured(*arguments)
-    ((_, _, result),) = attacks(settings, classifier or by_color(), torch.device("cpu"))
+    ((_, _, result),) = attacks(settings, classifier or by_color())
     return result
 
 
@@ -69,7 +69,7 @@ def test_a_scene_that_is_classified_correctly_is_attacked_as_it_is_and_rendered_
     render = Mock(side_effect=Scene.render)
     monkeypatch.setattr(Scene, "render", lambda *given: render(*given))
     settings = configured("attack.max_steps=0")
-    ((_, scene, result),) = attacks(settings, by_color(), torch.device("cpu"))
+    ((_, scene, result),) = attacks(settings, by_color())
     assert result.clean_correct.all()
     assert scene == settings.scene
     # Images before the attack, and the initial values of the search.
@@ -87,7 +87,7 @@ def test_a_scene_in_which_the_mesh_is_recognized_is_searched_for():
 
     classifier = Classifier(is_light, 8, ("orange", "other"))
     settings = configured()
-    ((name, scene, result),) = attacks(settings, classifier, torch.device("cpu"))
+    ((name, scene, result),) = attacks(settings, classifier)
     assert name == "solid:orange:0"
     assert result.clean_correct.all()
     assert scene == replace(settings.scene, backgrounds=[0.9])

@@ -132,7 +132,7 @@ def test_a_mistake_is_one_line_of_error_and_nothing_written(call, here, capsys, 
     "command", [EVALUATE, ["attack", "network=run:1.10"], ["lab"]], ids=lambda given: given[0]
 )
 def test_two_commands_do_not_write_in_one_folder(call, here, capsys, command):
-    with sole_writer("out", here / "out"):
+    with sole_writer(here / "out"):
         assert call(*command, "out=out") == USER_ERROR
     assert "error: out=out " in capsys.readouterr().err
     assert not (here / "out").exists()

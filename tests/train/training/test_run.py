@@ -496,7 +496,7 @@ def test_a_logger_gets_the_metrics_of_each_epoch_in_place_of_tensorboard(tmp_pat
     log.scalars({"loss": 2.0}, 1)
     log.renders(torch.zeros(1, 3, 8, 8), 1)
     log.scalars({"loss": 1.0}, 2)
-    log.scalars({"accuracy": 0.5})
+    log.scalars({"accuracy": 0.5}, 3, is_final=True)
     assert lines == [(1, {"loss": 2.0}), (2, {"loss": 1.0}), (3, {"accuracy": 0.5})]
     assert len(read_metrics(tmp_path)) == 3
     assert not list(tmp_path.glob("events.out*"))
