@@ -373,7 +373,7 @@ def _transforms_intrinsics(entries: Mapping[str, Any]) -> tuple[np.ndarray, tupl
     height = int(entries["h"] if has_size else round(width * ratio))
     sides = zip("xy", (width, height), tangents, strict=True)
     given = [entries.get(f"fl_{axis}", side / 2 / t if t else None) for axis, side, t in sides]
-    focal_lengths = [float(length) for length in given if length]
+    focal_lengths = [float(length) for length in given if length is not None]
     if not focal_lengths:
         keys = "fl_x, fl_y, camera_angle_x or camera_angle_y"
         raise InputError(f"the cameras have no focal length: give {keys}")

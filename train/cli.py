@@ -40,7 +40,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 import conf
-from renderer.errors import InputError, keyed
+from renderer.errors import InputError, explained, keyed
 from renderer.settings import Settings, facts_of, field_types
 from train import system
 
@@ -188,6 +188,9 @@ class Command:
         prints nothing. All other errors are raised.
         """
         try:
+            # Relative paths mean nothing in a folder that was deleted.
+            with explained("the current folder is gone", "change to another folder", "", OSError):
+                os.getcwd()
             yield
             # If the output is a closed pipe, this raises BrokenPipeError.
             print(end="", flush=True)

@@ -1,6 +1,7 @@
 """The folder of a run or of another command: its files' names, their text, and its lock."""
 
 import json
+import math
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
@@ -82,6 +83,9 @@ def read_metrics(folder: Path) -> list[dict[str, float]]:
         lines = [_parse_object(line) for line in text.split("\n")[:-1]]
         if any(not isinstance(value, int | float) for line in lines for value in line.values()):
             raise ValueError("a value is not a number")
+        epochs = [line.get("epoch", math.inf) for line in lines]
+        if epochs != sorted({*epochs}):
+            raise ValueError("epochs are repeated, or follow the final scores")
         return lines
 
 

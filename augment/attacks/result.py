@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -276,6 +277,12 @@ class AttackResult(ShortRepr):
         chart.set_xlabel(self.classifier.task.confidence, fontsize=8)
         chart.legend(fontsize=8, loc="lower right")
         return figure
+
+    def _repr_png_(self) -> bytes:
+        """Return `plot()` as a PNG file, which notebooks display."""
+        content = BytesIO()
+        self.plot().savefig(content, format="png")
+        return content.getvalue()
 
     def _shown_view(self, example: int | None, view: int | None) -> tuple[int, int]:
         """Return an example and a view, where None is replaced by what shows the attack best."""

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from augment.scene import loops, patterns, surfaces
 from augment.scene.surfaces import Range, limits
-from renderer.errors import as_list, require_choice, require_number
+from renderer.errors import InputError, as_list, require_choice, require_number
 from renderer.image import straight_through
 from renderer.settings import Size, height_and_width
 
@@ -358,6 +358,8 @@ class CastShadow(LightModel):
         for kind in as_list("kinds", self.kinds, str, "a list of names"):
             require_choice("kinds", kind, SHADOWS)
         object.__setattr__(self, "kinds", tuple(self.kinds))
+        if not self.kinds:
+            raise InputError("kinds is empty: name at least one kind of shadow")
 
     def light(self, drawn: Drawn) -> Illumination:
         """Compute the light of the sun and of the sky."""

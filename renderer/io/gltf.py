@@ -150,7 +150,9 @@ def _attributes(
         attributes[name] = values.astype(np.float64)
     # Each morph target has changes of attributes, which are added with a weight each.
     targets = primitive.get("targets", [])
-    for weight, target in zip(weights, targets, strict=bool(weights)):
+    if weights and len(weights) != len(targets):
+        raise ValueError(f"it has {len(weights)} weights for {len(targets)} morph targets")
+    for weight, target in zip(weights, targets, strict=False):
         for name, index in target.items():
             if weight != 0 and name in attributes:
                 change = file.array(index)
@@ -158,6 +160,9 @@ def _attributes(
                 if len(change) != len(attributes[name]):
                     raise ValueError(f"a morph target has {len(change)} entries of {name}")
                 attributes[name] = attributes[name] + weight * change
+    counts = {name: len(values) for name, values in attributes.items()}
+    if len({*counts.values()}) > 1:
+        raise ValueError(f"its attributes have unequal numbers of entries: {counts}")
     return attributes
 
 

@@ -403,6 +403,8 @@ def read_material(file: GltfFile, index: int | None) -> Material:
         if extensions.get(name, {}).get(factor, 0) > 0:
             raise ValueError(f"a material lets light pass ({name}): make it opaque")
     mode = entry.get("alphaMode", "OPAQUE")
+    if mode not in ("OPAQUE", "MASK", "BLEND"):
+        raise ValueError(f"a material has the alphaMode {mode}: use OPAQUE, MASK or BLEND")
     material = Material(np.ones(4), mode, entry.get("alphaCutoff", 0.5))
     if SPECULAR_GLOSSINESS in extensions:
         return _specular_glossiness(material, file, extensions[SPECULAR_GLOSSINESS])
@@ -447,7 +449,7 @@ def _specular_glossiness(material: Material, file: GltfFile, model: dict[str, An
     """
     material = _with_color(material, file, model, "diffuse")
     # Specular color and glossiness become arrays (H, W, 3) and (H, W) if there is a texture.
-    specular = np.clip(model.get("specularFactor", [1.0] * 3), 0.0, 1.0)
+    specular = np.clip(model.get("specularFactor", [1.0] * 3), 0.0, 1.0).reshape(3)
     glossiness = np.array(model.get("glossinessFactor", 1.0))
     placement = None
     if "specularGlossinessTexture" in model:
@@ -486,7 +488,7 @@ def _specular_glossiness(material: Material, file: GltfFile, model: dict[str, An
 
 def _with_color(material: Material, file: GltfFile, model: dict[str, Any], name: str) -> Material:
     """Return a material with the factor and the texture whose names begin with `name`."""
-    color = np.clip(model.get(f"{name}Factor", [1.0] * 4), 0.0, 1.0)
+    color = np.clip(model.get(f"{name}Factor", [1.0] * 4), 0.0, 1.0).reshape(4)
     material = replace(material, color=color)
     if f"{name}Texture" not in model:
         return material

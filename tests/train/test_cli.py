@@ -257,6 +257,15 @@ def test_an_interrupt_while_torch_is_imported_is_one_line():
     assert ended.stderr == "ended by SIGINT\n"
 
 
+def test_a_folder_that_was_deleted_is_one_line(tmp_path):
+    code = f"import os, scripts.fit as fit; os.mkdir(gone := {str(tmp_path / 'gone')!r}); "
+    code += "os.chdir(gone); os.rmdir(gone); fit.main()"
+    command = [sys.executable, "-c", code]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=100, cwd=ROOT)
+    assert ended.returncode == USER_ERROR
+    assert re.fullmatch(r"error: the current folder is gone .*\n", ended.stderr)
+
+
 def test_a_command_may_print_if_the_shell_has_closed_its_outputs():
     code = "import sys; from train.system import set_up_process; set_up_process(); "
     code += "print(1); sys.stderr.write(str(sys.stderr.isatty()))"

@@ -49,8 +49,14 @@ for number in range(9):
         (METRICS, "{\n"),
         (METRICS, '{"test/accuracy": "high"}\n'),
         (METRICS, '{"epoch": 1}\n[]\n'),
+        (METRICS, 2 * '{"test/accuracy": 1}\n'),
+        (METRICS, '{"test/accuracy": 1}\n{"epoch": 1}\n'),
+        (METRICS, '{"epoch": 1}\n{"epoch": 1}\n{"test/accuracy": 1}\n'),
     ],
-    ids=["list", "bomb", "code", "variable", "cut", "text", "no object"],
+    ids=[
+        *("list", "bomb", "code", "variable", "cut", "text", "no object"),
+        *("two final lines", "final line before its end", "doubled epoch"),
+    ],
 )
 def test_a_damaged_file_is_one_sentence_that_names_it(tmp_path, file, content):
     (tmp_path / file).write_text(content)

@@ -132,8 +132,9 @@ def read_masks(folder: Path) -> tuple[list[Annotated], dict[str, Path], list[str
     else:
         raise InputError(f"photos={folder} lacks images/ or masks/: move them there", "photos")
     shown = [str(item.path) for item in find_unlabeled(images)]
-    all_paths = {name: (masks / name).with_suffix(".png") for name in shown}
-    paths = {name: path for name, path in all_paths.items() if path.is_file()}
+    places = ((name, masks / form) for name in shown for form in _spellings(name))
+    all_paths = ((name, place.with_suffix(".png")) for name, place in places)
+    paths = {name: path for name, path in all_paths if path.is_file()}
     missing = [name for name in shown if name not in paths]
     if not paths:
         first = Path(missing[0]).with_suffix(".png")
@@ -268,18 +269,22 @@ def _find_images(file: Path, names: Sequence[str]) -> dict[str, Path]:
     is_beside = file.parent.name != "annotations"
     folders = [file.parent] if is_beside else [file.parent.parent, file.parent]
     # An image beside the file replaces one in the folder above.
-    paths = {name: of / name for of in folders for name in names if (of / name).is_file()}
+    places = ((name, of / form) for of in folders for name in names for form in _spellings(name))
+    paths = {name: path for name, path in places if path.is_file()}
     # Other images in the folder, by name without folder. Most files need no search.
     others: dict[str, list[Path]] = defaultdict(list)
     used = {*paths.values()}
     for path in visible_files(folders[0]) if len(paths) < len(names) else ():
         if path.suffix.lower() in SUFFIXES and folders[0] / path not in used:
-            others[path.name].append(folders[0] / path)
-    uses = Counter(PurePosixPath(name).name for name in names)
+            others[normalize("NFC", path.name)].append(folders[0] / path)
+    uses = Counter(PurePosixPath(normalize("NFC", name)).name for name in names)
     for name in [name for name in names if name not in paths]:
-        parts = PurePosixPath(name).parts
+        parts = PurePosixPath(normalize("NFC", name)).parts
         # Number of equal parts at the end of the path of each image of this name.
-        equal_parts = {image: _equal_ends(image.parts, parts) for image in others[parts[-1]]}
+        equal_parts = {
+            image: _equal_ends(Path(normalize("NFC", str(image))).parts, parts)
+            for image in others[parts[-1]]
+        }
         most = max(equal_parts.values(), default=0)
         # An image in another folder may be any of several that have its name.
         if most == 1 and uses[parts[-1]] > 1:
@@ -361,9 +366,13 @@ def _label_files(path: Path) -> list[Path]:
     above, images, below = beside.absolute().as_posix().rpartition("/images/")
     if images:
         files.insert(0, Path(f"{above}/labels/{below}"))
-    # Accents in names may have another form of Unicode, since archives of a Mac change them.
-    forms = [file.with_name(normalize(form, file.name)) for file in files for form in FORMS]
+    forms = [file.with_name(form) for file in files for form in _spellings(file.name)]
     return [*files, *forms]
+
+
+def _spellings(name: str) -> list[str]:
+    """Return the other forms of Unicode of a name, which archives of a Mac change, and the name."""
+    return [*({normalize(form, name) for form in FORMS} - {name}), name]
 
 
 def _yaml_mapping(file: Path) -> dict[str, Any]:

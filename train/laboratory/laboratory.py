@@ -515,9 +515,8 @@ def kept_aside_settings(
             label = class_of_simplified.get(simplified(name), OTHER_PREFIX + name)
             meshes += _generated(name, label, NEGATIVE_COUNT)
     setups = settings.evaluate.laboratory_setups
-    seed = FIRST_SEED + settings.seed
     rendered = str(out), settings.label, meshes, setups, [*OTHER_PATTERNS]
-    return LabSettings(*rendered, size=size, seed=seed, overwrite=True)
+    return LabSettings(*rendered, size=size, seed=FIRST_SEED, overwrite=True)
 
 
 def can_be_generated(label: str) -> bool:

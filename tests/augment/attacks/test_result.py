@@ -1,3 +1,5 @@
+import io
+
 import numpy as np
 import pytest
 from PIL import Image, ImageSequence
@@ -31,6 +33,7 @@ def test_a_plot_shows_the_images_the_light_and_the_probabilities_of_its_example(
     for container, probabilities in zip(bars.containers, expected, strict=True):
         widths = [bar.get_width() for bar in container]
         np.testing.assert_allclose(widths, probabilities[rows], atol=1e-6)
+    assert Image.open(io.BytesIO(result._repr_png_())).format == "PNG"  # for notebooks
 
 
 @pytest.mark.parametrize("suffix", ["gif", "webp"])

@@ -86,6 +86,11 @@ def test_a_penumbra_is_the_sharp_shadow_averaged_over_the_disc_of_the_sun(kind):
     assert error.mean() < 0.01 and np.ptp(averaged) > 0.9
 
 
+def test_a_shadow_of_no_kind_is_refused():
+    with pytest.raises(nb.InputError, match="kinds is empty"):
+        lights.CastShadow(())
+
+
 def test_lamps_add_up():
     model = lights.ColoredLamps()
     drawn = drawn_of(model, {model.dimensions: 0.99})

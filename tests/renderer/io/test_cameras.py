@@ -121,6 +121,7 @@ OTHER_KINDS |= {"ftheta_p1": 0.4, "camera_type": "fisheye", "camera_model": "OPE
         ({"k1": 0.1}, "undistort"),
         ({"camera_angle_x": ..., "fl_x": FOCAL_X, "w": ..., "h": ...}, "image size"),
         ({"camera_angle_x": ...}, "no focal length"),
+        ({"camera_angle_x": ..., "fl_x": 0, "fl_y": FOCAL_Y}, "intrinsics"),
     ],
 )
 def test_transforms_that_describe_no_pinhole_cameras_with_names_are_refused(

@@ -660,6 +660,10 @@ REFUSED = {
     "specular color": plain(
         extensions={"KHR_materials_specular": {"specularColorFactor": [1, 0, 0]}}
     ),
+    "unequal numbers": with_mode(4, COLOR_0=np.ones((1, 4), np.float32)),
+    "weights for 0 morph targets": with_tree(nodes=[{"mesh": 0, "weights": [1.0]}]),
+    "alphaMode blend": plain(alphaMode="blend"),
+    "into shape": plain(pbrMetallicRoughness={"baseColorFactor": [0.5]}),
     "color or texture": plain(extensions={"KHR_materials_specular": {"specularTexture": {}}}),
 }
 

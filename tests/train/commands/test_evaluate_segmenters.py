@@ -70,6 +70,13 @@ def test_borders_are_not_scored_and_masks_follow_the_photographs(folder, fit):
     assert scores.miou.low < scores.miou.value < scores.miou.high
 
 
+def test_masks_may_have_another_form_of_unicode(folder):
+    (folder / "images/part/0.png").rename(folder / "images/part/a\u0308.png")
+    (folder / "masks/part/0.png").rename(folder / "masks/part/\u00e4.png")
+    scores = nb.evaluate(_by_brightness, folder, classes=CLASSES, size=SIZE)
+    assert (scores.photograph_count, scores.missing) == (3, [])
+
+
 def test_palettes_and_folders_of_voc_are_read_and_photographs_without_a_mask_are_named(folder):
     (folder / "images").rename(folder / "JPEGImages")
     (folder / "masks").rename(folder / "SegmentationClass")

@@ -46,6 +46,8 @@ def _write_coco(file, names=("a.png",), size=(80, 40), box=BOX, **changes):
         ("a.json", "plain/a.png", "a.png"),
         ("annotations/a.json", "val/a.png", "a.png"),
         ("a.json", "images/a.png", "..\\elsewhere\\images\\a.png"),
+        ("a.json", "a\u0308/a\u0308.png", "\u00e4/\u00e4.png"),
+        ("a.json", "plain/\u00e4.png", "a\u0308.png"),
     ],
 )
 def test_images_of_coco_are_found_in_subfolders(tmp_path, file, image, name):

@@ -23,6 +23,9 @@ def test_no_instance_and_no_pattern_is_one_of_training(settings, tmp_path):
     assert trained.isdisjoint(meshes)
     assert all(len(mesh.split(":")) == 3 for mesh in meshes)
     assert set(aside.patterns).isdisjoint(TRAINED_PATTERNS)
+    # The runs of a sweep are compared on the same images.
+    other = replace(settings, seed=5)
+    assert kept_aside_settings(other, ["orange", "apple"], 32, tmp_path) == aside
 
 
 def test_hard_negatives_have_the_class_of_the_network_or_none(settings, tmp_path):
