@@ -160,7 +160,10 @@ def build_scene(
         pixels = views * len(objects) * image.pixel_count
         degree = degree_of_scene(smoothest, settings.degree, pixels)
         environment = load_light(environment, degree, smoothest.gloss_roughness)
-        _warn_of_wrong_irradiance(settings.light, environment, degree)
+        # Without gloss, light of half the reference degree is exact enough. For gloss, a window
+        # that keeps highlights from ringing dims the light of any degree.
+        if degree < REFERENCE_DEGREE // 2 or smoothest.gloss_roughness is not None:
+            _warn_of_wrong_irradiance(settings.light, environment, degree)
         if settings.degree is None:
             lights_of_degree = partial(_lights_of_degree, settings)
     else:
@@ -406,8 +409,6 @@ def _warn_of_wrong_irradiance(name: str, light: Tensor, degree: int) -> None:
 
     The irradiance is compared with that of the same lighting of degree 8.
     """
-    if degree >= REFERENCE_DEGREE // 2:
-        return
     error = float(harmonics.irradiance_error(light, load_light(name, REFERENCE_DEGREE)))
     if error > MAX_IRRADIANCE_ERROR:
         reason = f"has an irradiance that is off by {error:.0%} (rms over normals)"

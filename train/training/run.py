@@ -20,6 +20,7 @@ from renderer.errors import InputError, keyed, keys_of
 from renderer.image import to_unit
 from renderer.io.files import remove
 from train import checkpoints, console
+from train.cli import read_settings
 from train.data import photographs
 from train.data.sets import DataSet, Split, channel_statistics, held_out_rows
 from train.device import MixedPrecision, place
@@ -29,9 +30,22 @@ from train.results.metrics import METRICS
 from train.results.overwrite import remove_run
 from train.results.predictions import SUMMARY
 from train.results.scoring import Model, Predictor, evaluate_photographs, format_scores
-from train.run_config import CONFIG, require_same_run, require_same_weights, write_config
+from train.run_config import (
+    CONFIG,
+    read_config,
+    require_same_run,
+    require_same_weights,
+    write_config,
+)
 from train.run_folder import BEFORE, BEST, WEIGHTS
-from train.settings import KEPT_ASIDE, LABORATORY, WIDERESNET, ExperimentSettings, in_light
+from train.settings import (
+    KEPT_ASIDE,
+    LABORATORY,
+    PHOTOGRAPHS_FIRST,
+    WIDERESNET,
+    ExperimentSettings,
+    in_light,
+)
 from train.training import inputs
 from train.training.averages import INTERPOLATION, interpolate, predict
 from train.training.loop import Trainer, evaluate
@@ -110,6 +124,7 @@ class Run:
             self.trainer = self._build_trainer(record, threads)
             if settings.train.recognize:
                 recognizing_layers(self.trainer.model.network, self.data.size)
+        self.before = self._network_before()
         # Number of CPU threads with which the run trains.
         self._threads = torch.get_num_threads()
         if self._is_resumed:
@@ -173,6 +188,21 @@ class Run:
         options = description, service, self.folder, data.labeled, initial is not None
         return Trainer(recipe, model, *options)
 
+    def _network_before(self) -> MixedPrecision | None:
+        """Return the initial network, or the one before a first training on photographs."""
+        before = self.trainer.initial
+        first = Path(str(self.settings.network))
+        own = [of / PHOTOGRAPHS_FIRST for of in (self.folder, self.folder.parent)]
+        if before is None or first not in own:
+            return before
+        # The file has facts beside the settings.
+        recorded = OmegaConf.masked_copy(read_config(first / CONFIG), [*vars(self.settings)])
+        original = inputs.load_initial(read_settings(ExperimentSettings, recorded))
+        before = deepcopy(before)
+        network = exposure.without_normalized_light(before.network)
+        cast(inputs.Initial, original).copy_to(network, self.trainer.architecture)
+        return before
+
     def _build_network(self, shape: dict[str, Any]) -> nn.Module:
         """Build the network without its trained weights, or copy the one that the caller gave."""
         if self.initial and self.initial.network is not None:
@@ -218,8 +248,8 @@ class Run:
         if log:
             self._render_kept_aside()
         scores: dict[str, float] = {}
-        if trainer.initial and not trainer.is_detector:
-            scores = self._score_initial(trainer.initial)
+        if self.before and not trainer.is_detector:
+            scores = self._score_initial(self.before)
         # `_score_initial` may have replaced labels. An unreadable file is replaced in its own part.
         split = self.data.train.to(trainer.device)
         train, validation = (split.part(rows) for rows in (~self.held_out, self.held_out))
@@ -359,7 +389,7 @@ class Run:
         network for unchanged images.
         """
         scores = {}
-        for name, model in (("before", self.trainer.initial), ("after", self.trainer.selected)):
+        for name, model in (("before", self.before), ("after", self.trainer.selected)):
             relit = self._predict(cast(Model, model), self.data.test, self.settings.seed, "test")
             scores[f"test/relit_agreement_{name}"] = (relit == targets).double().mean().item()
         line = "agreement with the original on %d test images: unchanged %.3f; "

@@ -234,6 +234,21 @@ def test_a_light_that_a_low_degree_cuts_off_is_told(tmp_path, degree, told):
     assert bool(told) == bool(warned)
 
 
+def test_a_window_for_highlights_that_dims_the_light_is_told(tmp_path):
+    """At degree 6, a kernel without negative values for a roughness of 0.2 dims a sun by 17 %."""
+    sun = torch.zeros(64, 128, 3)
+    sun[20, 30] = 100
+    write_map(tmp_path / "sun.npy", sun)
+    light = str(tmp_path / "sun.npy")
+    scene, warned = scene_of((Gloss(0.2).on(solid("orange")), "orange"), light=light, degree=6)
+    difference = load_light(light, 8)
+    exact = irradiance_rms(difference)
+    difference[:49] -= scene.lights[0]
+    error = irradiance_rms(difference) / exact
+    assert error > 0.1
+    assert f"irradiance that is off by {error:.0%}" in warned
+
+
 def test_a_degree_whose_operators_no_memory_holds_is_lowered_and_said():
     """Operators of 10⁹ pixels take 392 GB at degree 6, so that no higher degree is chosen."""
     with pytest.warns(UserWarning, match="degree=6, the highest that fits"):

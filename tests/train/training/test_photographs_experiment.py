@@ -1,9 +1,12 @@
 """experiment=photographs learns from unlabeled photographs in the light of a projector."""
 
+import csv
+
 import pytest
 import torch
 from torch.distributions import Categorical, kl_divergence
 
+import norm_balls as nb
 from augment.random_streams import generator
 from renderer.image import to_unit
 from tests.runs import completed_run
@@ -14,7 +17,7 @@ from train.commands import experiment
 from train.data.sets import Split
 from train.device import MixedPrecision
 from train.results.page import PAGE
-from train.run_folder import BEST, LAST, read_metrics
+from train.run_folder import BEFORE, BEST, LAST, read_metrics
 from train.settings import PHOTOGRAPHS_FIRST, TrainSettings
 from train.training import run
 from train.training.augmentations import Augmentation, relit
@@ -64,9 +67,15 @@ def chain(small):
 
 
 @pytest.mark.slow
-def test_one_command_trains_on_photographs_then_the_last_layer_on_renders(chain, weights, tmp_path):
+def test_one_command_trains_on_photographs_then_the_last_layer_on_renders(
+    chain, weights, photographs, tmp_path, monkeypatch
+):
     folder = tmp_path / "run"
-    chain(folder)
+    # Both trainings change many answers.
+    monkeypatch.setattr(
+        experiment, "SHARED_IN_TRAIN", (*experiment.SHARED_IN_TRAIN, "learning_rate")
+    )
+    chain(folder, f"photos={photographs}", "train.learning_rate=0.01")
     original = torch.load(weights)
     relit = torch.load(folder / PHOTOGRAPHS_FIRST / "weights.pt")
     hardened = torch.load(folder / "weights.pt")
@@ -75,6 +84,14 @@ def test_one_command_trains_on_photographs_then_the_last_layer_on_renders(chain,
     assert not torch.equal(relit["conv1.0.weight"], original["conv1.0.weight"])
     changed = {name for name in original if not torch.equal(relit[name], hardened[name])}
     assert changed == {"fc.weight", "fc.bias"}
+    # What the run calls the network before hardening is that of the user, in the same precision.
+    with (folder / BEFORE / "photographs/predictions.csv").open() as file:
+        scored = [float(row["orange_log_odds"]) for row in csv.DictReader(file)]
+    network = nb.load_classifier(
+        SHORT_TRAINING[0].removeprefix("network="), weights=weights, size=32
+    )
+    scores = nb.evaluate(network, photographs, label="orange", precision="float32")
+    assert scores.predicted.predictions.log_odds == pytest.approx(scored, abs=1e-4)
     page = (folder / PAGE).read_text()
     for stage in (folder / PHOTOGRAPHS_FIRST, folder):
         assert f"{stage}:" in page
