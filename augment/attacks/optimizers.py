@@ -222,7 +222,6 @@ class Optimizer(ABC):
     the examples that are still attacked.
 
     Attributes:
-        uses_gradients: Whether `tell` needs the gradient of the cost.
         candidate_count: Number P of candidates of each example that `ask` returns.
         accepts_all: Whether candidates are accepted that do not lower the cost.
         values: Values of the accepted candidate of each example, shape (E, D).
@@ -231,7 +230,6 @@ class Optimizer(ABC):
         length_factors: Factors of the length after an accepted candidate, and after another.
     """
 
-    uses_gradients: ClassVar[bool] = False
     candidate_count: int = 1
     accepts_all: bool = False
     length_factors: ClassVar[tuple[float, float]] = (1.0, 1.0)
@@ -279,7 +277,6 @@ class Gradient(Optimizer):
     length. Without it, every candidate is accepted.
     """
 
-    uses_gradients = True
     length_factors = (1.0, 0.5)
 
     def begin(self, examples: Examples, start: Values) -> None:
