@@ -257,12 +257,10 @@ def attack_photographs(
         tensor(0.4100)
     """
     require_photographs("photographs", photographs)
-    expected = "RelightingSettings(...) or None"
-    errors.require_kind("settings", settings, RelightingSettings | None, expected)
+    settings = RelightingSettings.or_default("settings", settings)
     errors.require_whole("seed", seed)
     if limit is not None:
         errors.require_whole("limit", limit, 1)
-    settings = settings or RelightingSettings()
     success_settings = AttackSettings(sensor_noise=sensor_noise, batch_size=batch_size)
     size = as_size("photographs", photographs.shape[-2:])
     with wrappers.gradient_flags_kept(network):

@@ -142,10 +142,9 @@ def attack(
         (tensor([True]), torch.Size([1, 3, 8, 8]))
     """
     require_kind("scene", scene, Scene, "a scene, such as nb.build_scene(...)")
-    require_kind("settings", settings, AttackSettings | None, "nb.AttackSettings(...) or None")
+    settings = AttackSettings.or_default("settings", settings, lighting=StepSettings())
     require_whole("seed", seed)
     require_flag("force", force)
-    settings = settings or AttackSettings(lighting=StepSettings())
     like = scene.lights
     given = scene.settings.size, classes, normalization, value_range, like.device, "classifier"
     options: dict[str, Any] = {"dtype": like.dtype, "task": task, "size_from": "the scene"}

@@ -132,9 +132,8 @@ def build_scene(
         >>> round(scene.objects[0].center[0])
         10
     """
-    errors.require_kind("scene", scene, SceneSettings | None, "SceneSettings(...) or None")
-    expected = "RendererSettings(...) or None"
-    errors.require_kind("renderer", renderer, RendererSettings | None, expected)
+    settings = SceneSettings.or_default("scene", scene)
+    renderer_settings = RendererSettings.or_default("renderer", renderer)
     errors.require_flag("shared", shared)
     errors.require_whole("views", views)
     errors.require_flag("normalize", normalize)
@@ -146,8 +145,8 @@ def build_scene(
         raise InputError(f"{unknown[0]} is no option of build_scene: choose from {choices}")
     scene_options = {name: options[name] for name in options.keys() & SCENE_OPTIONS}
     renderer_options = {name: options[name] for name in options.keys() - SCENE_OPTIONS}
-    settings = replace(scene or SceneSettings(), views=views, **scene_options)
-    renderer_settings = replace(renderer or RendererSettings(), **renderer_options)
+    settings = replace(settings, views=views, **scene_options)
+    renderer_settings = replace(renderer_settings, **renderer_options)
     objects = _load_objects(meshes, settings, renderer_settings.encoding)
     environment: Any = settings.light
     # Loads the lighting again with a higher degree, which a smoother surface may need later. It
