@@ -321,13 +321,13 @@ class Smoothest(NamedTuple):
 
     def affordable_degree(self, pixels: int) -> int:
         """Return the degree of lighting that the surface needs, as far as memory permits."""
-        degree = max(DEGREE, self.degree)
         free = errors.free_memory(torch.device("cpu"))
         # An unknown amount of free memory counts as enough.
-        limit = math.inf if free is None else free
-        while degree > DEGREE and OPERATOR_BYTES * pixels * (degree + 1) ** 2 > limit:
-            degree -= 1
-        return degree
+        if free is None:
+            return max(DEGREE, self.degree)
+        # Light of degree d has (d + 1)² coefficients.
+        fitting = math.isqrt(free // (OPERATOR_BYTES * pixels)) - 1
+        return max(DEGREE, min(self.degree, fitting))
 
     def warn(self, subject: str) -> None:
         """Warn that the degree of the lighting is too low for the highlights of the surface."""
