@@ -27,14 +27,14 @@ from augment.scene import objects as placed
 from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
 from augment.scene.truth import unlabeled
-from augment.settings import LOCAL_LIGHT_SETTINGS, ObjectSettings, RendererSettings, SceneSettings
+from augment.settings import ObjectSettings, RendererSettings, SceneSettings
 from renderer import errors
 from renderer.camera import Camera, orbit_cameras
 from renderer.errors import InputError
 from renderer.image import clamp, encode
 from renderer.io.images import gray_or_image
 from renderer.light import harmonics, ringing
-from renderer.light.basis import DEGREE, Basis, LitBasis, harmonics_of, with_local_lights
+from renderer.light.basis import DEGREE, Basis, harmonics_of, with_local_lights
 from renderer.light.environment import SUFFIXES
 from renderer.light.files import load_light
 from renderer.light.lamps import LOCAL_LIGHTS
@@ -46,8 +46,6 @@ from renderer.visibility import choose
 # Bytes of the linear operator from light to image, for each pixel and each coefficient of the
 # light: two channels of float32.
 OPERATOR_BYTES = 8
-# Class of each local light by its settings.
-LOCAL_LIGHT_OF_SETTINGS = {LOCAL_LIGHT_SETTINGS[name]: kind for name, kind in LOCAL_LIGHTS.items()}
 # A mesh is given as the path of its file, as "solid:NAME", or as a `Mesh`.
 MeshSource = str | Path | Mesh
 MeshItem = ObjectSettings | tuple[MeshSource, str | int]
@@ -167,7 +165,7 @@ def build_scene(
         # `degree_of` raises InputError if the shape is not that of coefficients.
         harmonics.degree_of(environment)
         errors.require_bounded(light=environment)
-    basis, lights = _build_lights(settings, environment)
+    basis, lights = build_lights(settings, environment)
     rasterizer = renderer_settings.rasterizer
     orbit = settings.width, settings.polar, settings.azimuth, settings.fov
     built = Scene.grid(
@@ -251,26 +249,17 @@ def _lights_of_degree(
     settings: SceneSettings, degree: int, roughness: float | None
 ) -> tuple[Basis, Tensor]:
     """Load the lights with another degree, for a roughness that is None without gloss."""
-    return _build_lights(settings, load_light(settings.light, degree, roughness))
+    return build_lights(settings, load_light(settings.light, degree, roughness))
 
 
-def _build_lights(settings: SceneSettings, environment: Tensor) -> tuple[Basis, Tensor]:
+def build_lights(settings: SceneSettings, environment: Tensor) -> tuple[Basis, Tensor]:
     """Join the environment lighting with the projector and the lamps of the settings.
 
     Return the basis of all lights and their RGB coefficients.
     """
-    given = [getattr(settings, name) for name in LOCAL_LIGHTS]
-    local = [build_local_light(light) for light in given if light is not None]
+    given = {kind: getattr(settings, name) for name, kind in LOCAL_LIGHTS.items()}
+    local = [kind.from_settings(light) for kind, light in given.items() if light is not None]
     return with_local_lights(environment * settings.given_exposure, local)
-
-
-def build_local_light(settings: Any) -> LitBasis:
-    """Build a local light, which is a projector or a group of lamps.
-
-    Return its basis and its RGB coefficients: the pixels of the projector or the powers of the
-    lamps.
-    """
-    return LOCAL_LIGHT_OF_SETTINGS[type(settings)].from_settings(settings)
 
 
 def load_backgrounds(choices: Sequence[float | str | Path], size: Size) -> Tensor:
