@@ -484,11 +484,8 @@ def expose(scene: Scene) -> Scene:
         if is_above:
             said += f", because projector and lamps alone exceed {aim:.2g}: lower their power"
         say_once(said)
-    examples = [
-        replace(example, exposure=example.exposure * factors[example.object])
-        for example in scene.examples
-    ]
-    return scene.changed(examples=examples)
+    exposures = [each.exposure * factors[each.object] for each in scene.examples]
+    return scene.changed(examples=placed.with_field(scene.examples, "exposure", exposures))
 
 
 def _probe(scene: Scene, rows: list[int]) -> Scene:
