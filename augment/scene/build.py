@@ -460,7 +460,7 @@ def expose(scene: Scene) -> Scene:
     """Choose the exposure of each object at which its pixels have the mean MEAN, and say it."""
     factors = []
     for index, item in enumerate(scene.objects):
-        rows = [row for row, example in enumerate(scene.examples) if example.object == index]
+        rows = scene.rows_of(index)
         # At most `PROBED` examples at equal distances. -(-a // b) divides and rounds up.
         probe = _probe(scene, rows[:: -(-len(rows) // PROBED)])
         # Light of projector and lamps, which the exposure leaves as it is.
@@ -527,13 +527,12 @@ def warn_of_exposure(scene: Scene, images: Float[Tensor, "E V 3 H W"] | None = N
     Without the images of all examples, that example is rendered.
     """
     # First example of each object.
-    seen: dict[int, int] = {}
-    for row, example in enumerate(scene.examples):
-        seen.setdefault(example.object, row)
-    rows = torch.tensor([*seen.values()][:PROBED], device=scene.lights.device)
+    shown_objects = scene.object_of.unique().tolist()[:PROBED]
+    firsts = [scene.rows_of(index)[0] for index in shown_objects]
+    rows = torch.tensor(firsts, device=scene.lights.device)
     shown = scene.render(scene.conditions(rows), rows) if images is None else images[rows]
     masks = scene.truth(unlabeled, rows).masks[:, :, 0]
-    for index, image, mask in zip(seen, shown, masks, strict=False):
+    for index, image, mask in zip(shown_objects, shown, masks, strict=True):
         mean = float(image.movedim(1, 0)[:, mask].mean()) if mask.any() else MEAN
         if not DARK <= mean <= BRIGHT:
             kind = "dark" if mean < DARK else "bright"
