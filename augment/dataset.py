@@ -135,11 +135,9 @@ def render_dataset(
     """
     for name, value in {"count": count, "first": first, "seed": seed}.items():
         require_whole(name, value)
-    expected = "nb.AugmentationSettings(...) or None"
-    require_kind("settings", settings, AugmentationSettings | None, expected)
     require_kind("network", network, TaskNetwork | None, "nb.load_classifier(...) or None")
     mode = "random" if network is None else "adversarial"
-    settings = settings or AugmentationSettings(mode=mode)
+    settings = AugmentationSettings.or_default("settings", settings, mode=mode)
     if settings.mode != mode:
         missing = "gets none" if network is None else "gets one"
         raise InputError(f"mode={settings.mode} does not fit a data set that {missing}: set {mode}")

@@ -23,7 +23,7 @@ from augment import network as wrappers
 from augment.attack_settings import RANDOM_SEARCH, AttackSettings, RelightingSettings, StepSettings
 from augment.attacks.loop import minimize
 from augment.attacks.objective import Examples, Objective, preprocessed_model
-from augment.attacks.optimizers import NormBalls, Optimizer, sample
+from augment.attacks.optimizers import NormBalls, Optimizer
 from augment.classifier import MAX_PROBED, UNIT_RANGE, Normalization, TaskNetwork, as_network
 from augment.progress import progress
 from augment.random_streams import generator
@@ -96,8 +96,7 @@ class UniformDraws(Optimizer):
     def ask(self, rows: Int[Tensor, " N"]) -> Float[Tensor, "N 1 D"]:
         """Draw factors of each photograph, whose logarithms are uniform in the ball."""
         problem, examples = self.problem, self.examples[rows].tolist()
-        draws = [(problem.start[[row]], problem.generators[row]) for row in examples]
-        return torch.stack([sample(problem.settings, *each) for each in draws])
+        return torch.stack([problem.draw(problem.generators[row], [row]) for row in examples])
 
 
 @dataclass(frozen=True, repr=False)
@@ -258,12 +257,10 @@ def attack_photographs(
         tensor(0.4100)
     """
     require_photographs("photographs", photographs)
-    expected = "RelightingSettings(...) or None"
-    errors.require_kind("settings", settings, RelightingSettings | None, expected)
+    settings = RelightingSettings.or_default("settings", settings)
     errors.require_whole("seed", seed)
     if limit is not None:
         errors.require_whole("limit", limit, 1)
-    settings = settings or RelightingSettings()
     success_settings = AttackSettings(sensor_noise=sensor_noise, batch_size=batch_size)
     size = as_size("photographs", photographs.shape[-2:])
     with wrappers.gradient_flags_kept(network):

@@ -174,8 +174,7 @@ class AugmentationService:
             >>> service.regenerate(model, number=0).images.shape
             torch.Size([10, 3, 8, 8])
         """
-        expected = "nb.AugmentationSettings(...) or None"
-        require_kind("settings", settings, AugmentationSettings | None, expected)
+        settings = AugmentationSettings.or_default("settings", settings)
         # Given cameras are the views themselves.
         options: dict[str, Any] = {"views": 1 if of_scene.get("cameras") else 10}
         if of_scene.get("scene") is None:
@@ -183,7 +182,6 @@ class AugmentationService:
         if of_scene.get("renderer") is None:
             options |= {"samples": 8, "normals": "flat"}
         options |= of_scene
-        settings = settings or AugmentationSettings()
         count = settings.examples
         if count == 0:
             raise InputError("settings.examples is 0: give the number of renders, or None")

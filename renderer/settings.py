@@ -20,7 +20,7 @@ from copy import deepcopy
 from dataclasses import MISSING, Field, dataclass, field, fields
 from functools import cache, partial
 from inspect import formatannotation
-from typing import Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
+from typing import Any, Self, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 import renderer.errors as errors
 from renderer.errors import InputError
@@ -178,6 +178,12 @@ class Settings:
                 raise InputError(f"{name} is {given}: give a value of type {expected}", name)
             if value is not None:
                 _check_value(name, value, facts)
+
+    @classmethod
+    def or_default(cls, name: str, given: Self | None, **defaults: Any) -> Self:
+        """Check the type of the argument of a function, and replace None by default settings."""
+        errors.require_kind(name, given, cls | None, f"nb.{cls.__name__}(...) or None")
+        return cls(**defaults) if given is None else given
 
     def wrong(self, name: str, text: str) -> InputError:
         """Make an error about a field, such as wrong("size", "is odd") for "size=3 is odd"."""

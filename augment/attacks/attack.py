@@ -24,6 +24,7 @@ from augment.network import gradient_flags_kept
 from augment.progress import Phases, progress
 from augment.random_streams import generator
 from augment.scene.build import warn_of_exposure, with_needed_degree
+from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from augment.settings import NormalizeLight, SceneSettings
 from augment.tasks.classification import Classification, class_index
@@ -141,10 +142,9 @@ def attack(
         (tensor([True]), torch.Size([1, 3, 8, 8]))
     """
     require_kind("scene", scene, Scene, "a scene, such as nb.build_scene(...)")
-    require_kind("settings", settings, AttackSettings | None, "nb.AttackSettings(...) or None")
+    settings = AttackSettings.or_default("settings", settings, lighting=StepSettings())
     require_whole("seed", seed)
     require_flag("force", force)
-    settings = settings or AttackSettings(lighting=StepSettings())
     like = scene.lights
     given = scene.settings.size, classes, normalization, value_range, like.device, "classifier"
     options: dict[str, Any] = {"dtype": like.dtype, "task": task, "size_from": "the scene"}
@@ -374,18 +374,17 @@ def _best_lights(
             exposure = settings.given_exposure * factor
             candidates.append(replace(settings, light=name, exposure=exposure))
             coefficients.append(light * exposure)
-    # Put all candidates into one scene, so that they are rendered and classified in large batches.
-    # Example n · E + e is example e of the scene in light n.
-    count = len(candidates)
-    skies = torch.stack(coefficients).repeat_interleave(len(scene), dim=0).to(scene.lights.device)
+    # Row n · E + e is example e of the scene in light n. All lights are rendered and classified in
+    # large batches.
+    examples = torch.arange(len(scene), device=scene.lights.device).repeat(len(candidates))
+    skies = torch.stack(coefficients).repeat_interleave(len(scene), dim=0).to(examples.device)
     # The first coefficients of an example are its environment light, and the others its projector
     # and lamps.
-    local_lights = scene.lights.repeat(count, 1, 1)[:, skies.shape[1] :]
-    lights = torch.cat([skies, local_lights], dim=1)
-    changed = scene.changed(examples=[*scene.examples] * count, lights=lights)
-    rows = torch.arange(len(changed), device=lights.device).split(changed.group_size)
-    images = torch.cat([changed.render(changed.conditions(some), some) for some in rows])
-    confidences = _confidences(changed, images, attack_settings, classifier, count)
+    lights = torch.cat([skies, scene.lights[examples, skies.shape[1] :]], dim=1)
+    groups = (of_row.split(scene.group_size) for of_row in (lights, examples))
+    pairs = zip(*groups, strict=True)
+    images = torch.cat([scene.render(Conditions(light), some) for light, some in pairs])
+    confidences = _confidences(scene, images, attack_settings, classifier)
     # Of equal confidences, that of the given light and exposure comes first.
     order = confidences.argsort(descending=True, stable=True)[:RENDERED_AGAIN].tolist()
     return [(float(confidences[index]), candidates[index]) for index in order]
@@ -393,23 +392,20 @@ def _best_lights(
 
 @torch.no_grad()
 def _confidences(
-    scene: Scene,
-    images: Images,
-    attack_settings: AttackSettings,
-    classifier: Classifier,
-    groups: int = 1,
-) -> Float[Tensor, " groups"]:
-    """Compute the confidence in each group of E / groups successive examples.
+    scene: Scene, images: Images, attack_settings: AttackSettings, classifier: Classifier
+) -> Float[Tensor, " lights"]:
+    """Compute the confidence in each light: images of all E examples in one light after the other.
 
     It is the lowest probability of the true class in its images, or 0 if one is misclassified.
     """
     labels = source_labels(scene, images.device, classifier)
-    # The objects of all groups are at the same places.
-    of_group = torch.arange(len(scene) // groups, device=images.device)
-    truth = partial(scene.truth, classifier.label, of_group)
-    criterion = classifier.task.criterion(labels[of_group], truth, len(classifier.classes))
-    criterion = criterion.map(lambda rows: rows.repeat(groups, *[1] * (rows.ndim - 1)))
+    truth = partial(scene.truth, classifier.label)
+    criterion = classifier.task.criterion(labels, truth, len(classifier.classes))
+    # The objects are at the same places in all lights.
+    count = len(images) // len(scene)
+    criterion = criterion.map(lambda rows: rows.repeat(count, *[1] * (rows.ndim - 1)))
     evidence = Objective(classifier, criterion, attack_settings).evidence(images)
-    confidence = classifier.task.confidences(evidence).gather(2, labels[..., None])[..., 0]
-    is_correct = criterion.predicted(evidence) == labels
-    return (confidence * is_correct).view(groups, -1).amin(1)
+    source = criterion.source
+    confidence = classifier.task.confidences(evidence).gather(2, source[..., None])[..., 0]
+    is_correct = criterion.predicted(evidence) == source
+    return (confidence * is_correct).view(count, -1).amin(1)

@@ -84,12 +84,12 @@ def check(result: AttackResult) -> dict[str, Any]:
     _add_draws(random, result, partial(result.problem.sample, draws, minimum.values))
     # The same examples are attacked again from their start, with more steps or queries.
     found = torch.stack([result.success, result.success_without_noise])
-    success = _rates(found, is_clean)
+    success = _fraction(found[:, is_clean])
     rates = {result.settings.step_limit: success}
     for factor in GROWTH:
         longer = replace(result, settings=result.settings.with_budget(factor))
         _attack_others(found, longer, result.problem.start.clone())
-        rates[longer.settings.step_limit] = _rates(found, is_clean)
+        rates[longer.settings.step_limit] = _fraction(found[:, is_clean])
     columns = zip(*rates.values(), strict=True)
     rates_by_steps = [dict(zip(rates, column, strict=True)) for column in columns]
     return {
@@ -99,7 +99,7 @@ def check(result: AttackResult) -> dict[str, Any]:
         "zero_gradient": _fraction(minimum.zero_gradient),
         **_named("success", success),
         "success_with_margin": _fraction(result.success_with_margin[is_clean]),
-        **_named("random_search", _rates(random, is_clean)),
+        **_named("random_search", _fraction(random[:, is_clean])),
         **_named("success_by_steps", rates_by_steps),
     }
 
@@ -327,19 +327,14 @@ def _add_successes(
         found[:, examples] |= torch.stack([fooled_in_views.all(1), without_noise])
 
 
-def _rates(found: Successes, is_counted: Bool[Tensor, " N"]) -> list[float]:
-    """Return the fractions of successes, with and without noise, among some examples."""
-    return [_fraction(mask) for mask in found[:, is_counted]]
-
-
 def _named(name: str, pair: Iterable[Any]) -> dict[str, Any]:
     """Name a value with sensor noise, and one without."""
     return dict(zip((name, f"{name}_without_noise"), pair, strict=True))
 
 
-def _fraction(values: Tensor) -> float:
-    """Return the fraction of true entries of a mask (N,), or 0 if it is empty."""
-    return float(values.double().mean()) if len(values) else 0.0
+def _fraction(values: Tensor) -> Any:
+    """Return the fraction of true entries of a mask, or of each row. It is 0 if a row is empty."""
+    return values.double().mean(-1).nan_to_num().tolist()
 
 
 def _scaled(settings: StepSettings, scale: float) -> StepSettings:

@@ -228,7 +228,7 @@ def minimize_from(
             # Step 0 evaluates the initial values.
             candidates = optimizer.ask(active) if step else start[:, None]
             # The last evaluation needs no gradient, because no step follows.
-            needs_gradient = optimizer.uses_gradients and step < settings.step_limit
+            needs_gradient = settings.uses_gradients and step < settings.step_limit
             with late_checks(checks if step and period > 1 else None):
                 evaluation = evaluate(optimizer.problem, part, candidates, shown, needs_gradient)
             if not step:

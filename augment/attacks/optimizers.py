@@ -9,6 +9,7 @@ A candidate is a vector of attack values that is evaluated next.
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, ClassVar, Protocol
@@ -65,36 +66,6 @@ class Problem(Protocol):
         """Return how much a search without gradients should change each value at first."""
 
 
-def sample(
-    settings: StepSettings,
-    center: Values,
-    draws: Generator,
-    used: Bool[Tensor, "A D"] | None = None,
-) -> Values:
-    """Draw a vector of values uniformly from the norm-ball around each center.
-
-    Values outside of the mask `used` are those of the center. None draws all values.
-    """
-    assert settings.radius is not None
-    is_used = None if used is None else used.cpu()
-    if settings.norm == "linf":
-        offset = 2 * torch.rand(center.shape, generator=draws) - 1
-    else:
-        direction = torch.randn(center.shape, generator=draws)
-        dimension_count: int | Tensor = center.shape[1]
-        if is_used is not None:
-            direction = direction * is_used
-            dimension_count = is_used.sum(1, keepdim=True)
-        # A uniform point of the unit ball in n dimensions has a distance below r with probability
-        # r^n. Its distance is distributed like the n-th root of a uniform number in [0, 1].
-        distance = torch.rand(len(center), 1, generator=draws) ** (1 / dimension_count)
-        # Rows without a used value stay at the center.
-        offset = torch.nn.functional.normalize(direction) * distance
-    if is_used is not None:
-        offset = offset * is_used
-    return center + settings.radius * offset.to(center)
-
-
 class NormBalls:
     """Values of E examples, in norm-balls around those at which attacks start.
 
@@ -105,8 +76,7 @@ class NormBalls:
         start: Values at which attacks start and on which the norm-balls are
             centered, shape (E, D).
         used_mask: Mask of the values that an attack may change, shape (E, D).
-            The other values have no effect on the image. None if every example
-            uses all values.
+            The other values have no effect on the image. By default, all may change.
         box: Smallest and largest feasible values.
     """
 
@@ -115,7 +85,9 @@ class NormBalls:
     def __init__(self, settings: StepSettings, start: Tensor, used_mask: Tensor | None = None):
         self.settings = settings
         self.start = start
-        self.used_mask = None if used_mask is not None and used_mask.all() else used_mask
+        # The default takes the memory of one value.
+        every = torch.ones((), dtype=torch.bool, device=start.device).expand(start.shape)
+        self.used_mask = every if used_mask is None else used_mask
 
     def truth(self, values: Values, examples: Examples) -> Truth | None:
         """Return None: objects in images that are not rendered stay where they are."""
@@ -163,9 +135,7 @@ class NormBalls:
             length = STEPS_OF_SEARCH * settings.step_size
             limits_each_value = settings.step == "sign"
         # 1 for values that have an effect, and 0 for the others, shape (E, D).
-        used = torch.ones_like(self.start[examples])
-        if self.used_mask is not None:
-            used = self.used_mask[examples].to(used)
+        used = self.used_mask[examples].to(self.start)
         if limits_each_value:
             return length / 2 * used
         # n independent numbers with the standard deviation length / √n form a vector that is
@@ -188,14 +158,27 @@ class NormBalls:
         """
         if self.settings.radius is None and reached is not None:
             # Each example gets a random direction, at the distance that its attack has reached.
-            direction = torch.randn(reached.shape, generator=draws).to(reached)
-            if self.used_mask is not None:
-                direction = direction * self.used_mask
+            direction = torch.randn(reached.shape, generator=draws).to(reached) * self.used_mask
             distance = (reached - self.start).norm(dim=1, keepdim=True)
             offset = direction * distance / direction.norm(dim=1, keepdim=True).clamp(min=1e-12)
             return self.project_feasible(self.start + offset)
-        drawn = sample(self.settings, self.start, draws, self.used_mask)
-        return self.project(drawn, slice(None))
+        return self.project(self.draw(draws), slice(None))
+
+    def draw(self, draws: Generator, examples: Sequence[int] | slice = slice(None)) -> Values:
+        """Draw values uniformly from the norm-balls of examples, which need a radius."""
+        assert self.settings.radius is not None
+        center, is_used = self.start[examples], self.used_mask[examples].cpu()
+        if self.settings.norm == "linf":
+            offset = 2 * torch.rand(center.shape, generator=draws) - 1
+        else:
+            direction = torch.randn(center.shape, generator=draws) * is_used
+            # A uniform point of the unit ball in n dimensions has a distance below r with
+            # probability r^n. Its distance is distributed like the n-th root of a uniform number.
+            root = 1 / is_used.sum(1, keepdim=True)
+            distance = torch.rand(len(center), 1, generator=draws) ** root
+            # Rows without a used value stay at the center.
+            offset = torch.nn.functional.normalize(direction) * distance
+        return center + self.settings.radius * (offset * is_used).to(center)
 
 
 # What is recorded of the best candidates: the fields of `Minimum` that belong to one candidate.
@@ -239,7 +222,6 @@ class Optimizer(ABC):
     the examples that are still attacked.
 
     Attributes:
-        uses_gradients: Whether `tell` needs the gradient of the cost.
         candidate_count: Number P of candidates of each example that `ask` returns.
         accepts_all: Whether candidates are accepted that do not lower the cost.
         values: Values of the accepted candidate of each example, shape (E, D).
@@ -248,7 +230,6 @@ class Optimizer(ABC):
         length_factors: Factors of the length after an accepted candidate, and after another.
     """
 
-    uses_gradients: ClassVar[bool] = False
     candidate_count: int = 1
     accepts_all: bool = False
     length_factors: ClassVar[tuple[float, float]] = (1.0, 1.0)
@@ -296,7 +277,6 @@ class Gradient(Optimizer):
     length. Without it, every candidate is accepted.
     """
 
-    uses_gradients = True
     length_factors = (1.0, 0.5)
 
     def begin(self, examples: Examples, start: Values) -> None:

@@ -11,7 +11,7 @@ from torch import Tensor
 from augment.attack_settings import AttackSettings
 from augment.attacks.objective import Examples, Images, Values
 from augment.attacks.parameters import make_parameter
-from augment.attacks.parameters.lights import Lighting, Skylight
+from augment.attacks.parameters.lights import Skylight
 from augment.attacks.parameters.material import Material
 from augment.attacks.parameters.offsets import Albedo, Geometry, Pixels
 from augment.attacks.parameters.parameter import Parameter
@@ -141,7 +141,7 @@ def build_problem(settings: AttackSettings, scene: Scene) -> SceneProblem:
         # Shadows and bounces would stay those of the first light.
         scene = scene.changed(one_light=False)
     of_light = {"nonnegative": not settings.allow_negative}
-    options = {Lighting.name: of_light, Skylight.name: of_light}
+    options = {"lighting": of_light, Skylight.name: of_light}
     options[Pixels.name] = {"is_alone": len(settings.parameters) == 1}
     parameters = [
         make_parameter(name, scene, steps, **options.get(name, {}))

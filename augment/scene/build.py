@@ -27,14 +27,14 @@ from augment.scene import objects as placed
 from augment.scene.objects import SceneObject
 from augment.scene.scene import Scene
 from augment.scene.truth import unlabeled
-from augment.settings import LOCAL_LIGHT_SETTINGS, ObjectSettings, RendererSettings, SceneSettings
+from augment.settings import ObjectSettings, RendererSettings, SceneSettings
 from renderer import errors
 from renderer.camera import Camera, orbit_cameras
 from renderer.errors import InputError
 from renderer.image import clamp, encode
 from renderer.io.images import gray_or_image
 from renderer.light import harmonics, ringing
-from renderer.light.basis import DEGREE, Basis, LitBasis, harmonics_of, with_local_lights
+from renderer.light.basis import DEGREE, Basis, harmonics_of, with_local_lights
 from renderer.light.environment import SUFFIXES
 from renderer.light.files import load_light
 from renderer.light.lamps import LOCAL_LIGHTS
@@ -46,8 +46,6 @@ from renderer.visibility import choose
 # Bytes of the linear operator from light to image, for each pixel and each coefficient of the
 # light: two channels of float32.
 OPERATOR_BYTES = 8
-# Class of each local light by its settings.
-LOCAL_LIGHT_OF_SETTINGS = {LOCAL_LIGHT_SETTINGS[name]: kind for name, kind in LOCAL_LIGHTS.items()}
 # A mesh is given as the path of its file, as "solid:NAME", or as a `Mesh`.
 MeshSource = str | Path | Mesh
 MeshItem = ObjectSettings | tuple[MeshSource, str | int]
@@ -132,9 +130,8 @@ def build_scene(
         >>> round(scene.objects[0].center[0])
         10
     """
-    errors.require_kind("scene", scene, SceneSettings | None, "SceneSettings(...) or None")
-    expected = "RendererSettings(...) or None"
-    errors.require_kind("renderer", renderer, RendererSettings | None, expected)
+    settings = SceneSettings.or_default("scene", scene)
+    renderer_settings = RendererSettings.or_default("renderer", renderer)
     errors.require_flag("shared", shared)
     errors.require_whole("views", views)
     errors.require_flag("normalize", normalize)
@@ -146,8 +143,8 @@ def build_scene(
         raise InputError(f"{unknown[0]} is no option of build_scene: choose from {choices}")
     scene_options = {name: options[name] for name in options.keys() & SCENE_OPTIONS}
     renderer_options = {name: options[name] for name in options.keys() - SCENE_OPTIONS}
-    settings = replace(scene or SceneSettings(), views=views, **scene_options)
-    renderer_settings = replace(renderer or RendererSettings(), **renderer_options)
+    settings = replace(settings, views=views, **scene_options)
+    renderer_settings = replace(renderer_settings, **renderer_options)
     objects = _load_objects(meshes, settings, renderer_settings.encoding)
     environment: Any = settings.light
     # Loads the lighting again with a higher degree, which a smoother surface may need later. It
@@ -171,7 +168,7 @@ def build_scene(
         # `degree_of` raises InputError if the shape is not that of coefficients.
         harmonics.degree_of(environment)
         errors.require_bounded(light=environment)
-    basis, lights = _build_lights(settings, environment)
+    basis, lights = build_lights(settings, environment)
     rasterizer = renderer_settings.rasterizer
     orbit = settings.width, settings.polar, settings.azimuth, settings.fov
     built = Scene.grid(
@@ -255,26 +252,17 @@ def _lights_of_degree(
     settings: SceneSettings, degree: int, roughness: float | None
 ) -> tuple[Basis, Tensor]:
     """Load the lights with another degree, for a roughness that is None without gloss."""
-    return _build_lights(settings, load_light(settings.light, degree, roughness))
+    return build_lights(settings, load_light(settings.light, degree, roughness))
 
 
-def _build_lights(settings: SceneSettings, environment: Tensor) -> tuple[Basis, Tensor]:
+def build_lights(settings: SceneSettings, environment: Tensor) -> tuple[Basis, Tensor]:
     """Join the environment lighting with the projector and the lamps of the settings.
 
     Return the basis of all lights and their RGB coefficients.
     """
-    given = [getattr(settings, name) for name in LOCAL_LIGHTS]
-    local = [build_local_light(light) for light in given if light is not None]
+    given = {kind: getattr(settings, name) for name, kind in LOCAL_LIGHTS.items()}
+    local = [kind.from_settings(light) for kind, light in given.items() if light is not None]
     return with_local_lights(environment * settings.given_exposure, local)
-
-
-def build_local_light(settings: Any) -> LitBasis:
-    """Build a local light, which is a projector or a group of lamps.
-
-    Return its basis and its RGB coefficients: the pixels of the projector or the powers of the
-    lamps.
-    """
-    return LOCAL_LIGHT_OF_SETTINGS[type(settings)].from_settings(settings)
 
 
 def load_backgrounds(choices: Sequence[float | str | Path], size: Size) -> Tensor:
@@ -325,13 +313,13 @@ class Smoothest(NamedTuple):
 
     def affordable_degree(self, pixels: int) -> int:
         """Return the degree of lighting that the surface needs, as far as memory permits."""
-        degree = max(DEGREE, self.degree)
         free = errors.free_memory(torch.device("cpu"))
         # An unknown amount of free memory counts as enough.
-        limit = math.inf if free is None else free
-        while degree > DEGREE and OPERATOR_BYTES * pixels * (degree + 1) ** 2 > limit:
-            degree -= 1
-        return degree
+        if free is None:
+            return max(DEGREE, self.degree)
+        # Light of degree d has (d + 1)² coefficients.
+        fitting = math.isqrt(free // (OPERATOR_BYTES * pixels)) - 1
+        return max(DEGREE, min(self.degree, fitting))
 
     def warn(self, subject: str) -> None:
         """Warn that the degree of the lighting is too low for the highlights of the surface."""
@@ -473,7 +461,7 @@ def expose(scene: Scene) -> Scene:
     """Choose the exposure of each object at which its pixels have the mean MEAN, and say it."""
     factors = []
     for index, item in enumerate(scene.objects):
-        rows = [row for row, example in enumerate(scene.examples) if example.object == index]
+        rows = scene.rows_of(index)
         # At most `PROBED` examples at equal distances. -(-a // b) divides and rounds up.
         probe = _probe(scene, rows[:: -(-len(rows) // PROBED)])
         # Light of projector and lamps, which the exposure leaves as it is.
@@ -497,11 +485,8 @@ def expose(scene: Scene) -> Scene:
         if is_above:
             said += f", because projector and lamps alone exceed {aim:.2g}: lower their power"
         say_once(said)
-    examples = [
-        replace(example, exposure=example.exposure * factors[example.object])
-        for example in scene.examples
-    ]
-    return scene.changed(examples=examples)
+    exposures = [each.exposure * factors[each.object] for each in scene.examples]
+    return scene.changed(examples=placed.with_field(scene.examples, "exposure", exposures))
 
 
 def _probe(scene: Scene, rows: list[int]) -> Scene:
@@ -543,13 +528,12 @@ def warn_of_exposure(scene: Scene, images: Float[Tensor, "E V 3 H W"] | None = N
     Without the images of all examples, that example is rendered.
     """
     # First example of each object.
-    seen: dict[int, int] = {}
-    for row, example in enumerate(scene.examples):
-        seen.setdefault(example.object, row)
-    rows = torch.tensor([*seen.values()][:PROBED], device=scene.lights.device)
+    shown_objects = scene.object_of.unique().tolist()[:PROBED]
+    firsts = [scene.rows_of(index)[0] for index in shown_objects]
+    rows = torch.tensor(firsts, device=scene.lights.device)
     shown = scene.render(scene.conditions(rows), rows) if images is None else images[rows]
     masks = scene.truth(unlabeled, rows).masks[:, :, 0]
-    for index, image, mask in zip(seen, shown, masks, strict=False):
+    for index, image, mask in zip(shown_objects, shown, masks, strict=True):
         mean = float(image.movedim(1, 0)[:, mask].mean()) if mask.any() else MEAN
         if not DARK <= mean <= BRIGHT:
             kind = "dark" if mean < DARK else "bright"

@@ -26,46 +26,46 @@ GRID = f"Tuple((float32[::1], float32[::1], {', '.join(4 * [ROWS])}))"
 
 
 def _loop(
-    signature: str, uses_tables: bool = False
-) -> Callable[[Callable[..., None]], Callable[..., Callable[..., None] | None]]:
-    """Return a decorator that delays the compilation until a loop is wanted for tensors.
+    signature: str, function: Callable[..., None]
+) -> Callable[..., Callable[..., None] | None]:
+    """Delay the compilation of a loop until it is wanted for tensors.
 
     The result is None without numba, and for tensors on a GPU, of 64 bits or with a gradient.
     """
 
-    def delayed(function: Callable[..., None]) -> Callable[..., Callable[..., None] | None]:
-        # The loop, compiled in the first call. None without numba.
-        @cache
-        def compiled() -> Callable[..., None] | None:
-            try:
-                import numba
-            except ImportError:
-                return None
-            settings: Any = numba.config
-            vectorize = settings.LOOP_VECTORIZE
-            # Vector instructions that look up a table are slower than single ones.
-            settings.LOOP_VECTORIZE = int(vectorize and not uses_tables)
-            for helper in (_between, _segment, _interpolate):
-                numba.extending.register_jitable(fastmath=True)(helper)
-            # Bytes are equal to those of torch, and light is to rounding.
-            options = {"nogil": True, "error_model": "numpy", "fastmath": not uses_tables}
-            njit: Any = partial(numba.njit, f"void({signature})", **options)
-            try:
-                loop = njit(cache=True)(function)
-            except Exception:  # If its cache is read-only or damaged.
-                loop = njit()(function)
-            finally:
-                settings.LOOP_VECTORIZE = vectorize
-            return lambda *values: loop(*map(_as_array, values))
+    # Loops over bytes look up tables.
+    uses_tables = "uint8" in signature
 
-        # The loop if it takes such a tensor, or None.
-        def fitting(values: Tensor) -> Callable[..., None] | None:
-            is_other = values.requires_grad or values.dtype == torch.float64
-            return None if is_other or values.device.type != "cpu" else compiled()
+    # The loop, compiled in the first call. None without numba.
+    @cache
+    def compiled() -> Callable[..., None] | None:
+        try:
+            import numba
+        except ImportError:
+            return None
+        settings: Any = numba.config
+        vectorize = settings.LOOP_VECTORIZE
+        # Vector instructions that look up a table are slower than single ones.
+        settings.LOOP_VECTORIZE = int(vectorize and not uses_tables)
+        for helper in (_between, _segment, _interpolate):
+            numba.extending.register_jitable(fastmath=True)(helper)
+        # Bytes are equal to those of torch, and light is to rounding.
+        options = {"nogil": True, "error_model": "numpy", "fastmath": not uses_tables}
+        njit: Any = partial(numba.njit, f"void({signature})", **options)
+        try:
+            loop = njit(cache=True)(function)
+        except Exception:  # If its cache is read-only or damaged.
+            loop = njit()(function)
+        finally:
+            settings.LOOP_VECTORIZE = vectorize
+        return lambda *values: loop(*map(_as_array, values))
 
-        return fitting
+    # The loop if it takes such a tensor, or None.
+    def fitting(values: Tensor) -> Callable[..., None] | None:
+        is_other = values.requires_grad or values.dtype == torch.float64
+        return None if is_other or values.device.type != "cpu" else compiled()
 
-    return delayed
+    return fitting
 
 
 def _as_array(value: Any) -> Any:
@@ -73,9 +73,8 @@ def _as_array(value: Any) -> Any:
     return np.ascontiguousarray(value.numpy()) if isinstance(value, Tensor) else value
 
 
-@_loop(
-    f"uint8[:,:,:,::1], {FIELD}, {ROWS}, {ROWS}, float32[::1], int32[::1], uint8[:,:,:,::1]",
-    uses_tables=True,
+@partial(
+    _loop, f"uint8[:,:,:,::1], {FIELD}, {ROWS}, {ROWS}, float32[::1], int32[::1], uint8[:,:,:,::1]"
 )
 def relit_bytes(
     colors: Any, field: Any, gain: Any, offset: Any, decoded: Any, carry: Any, out: Any
@@ -96,7 +95,7 @@ def relit_bytes(
                 shown[pixel] = (np.int32(value) + carry[value >> BIN_BITS]) >> BIN_BITS
 
 
-@_loop(f"uint8[:,::1], {ROWS}, {ROWS}, {ROWS}, {ROWS}, uint8[::1], uint8[:,::1]", uses_tables=True)
+@partial(_loop, f"uint8[:,::1], {ROWS}, {ROWS}, {ROWS}, {ROWS}, uint8[::1], uint8[:,::1]")
 def noisy_bytes(
     colors: Any, z: Any, middle: Any, slope: Any, curve: Any, encoded: Any, out: Any
 ) -> None:
@@ -148,7 +147,7 @@ def _interpolate(nodes: Any, weights: Any, columns: Any, out: Any) -> None:
             out[pixel] += node * columns[column, pixel]
 
 
-@_loop(f"{ROWS}, {GRID}, float32, {FIELD}, float32[:,:,::1]")
+@partial(_loop, f"{ROWS}, {GRID}, float32, {FIELD}, float32[:,:,::1]")
 def ramps(numbers: Any, grid: Any, strength: Any, field: Any, parts: Any) -> None:
     """Compute ramps, and their gains and offsets (see `LinearLight`)."""
     x, y = grid[:2]
@@ -162,7 +161,7 @@ def ramps(numbers: Any, grid: Any, strength: Any, field: Any, parts: Any) -> Non
                 field[image, 0, row, column] = right * x[column] + down * y[row]
 
 
-@_loop(f"int64[::1], {ROWS}, {ROWS}, {ROWS}, {GRID}, {FIELD}, float32[:,:,::1]")
+@partial(_loop, f"int64[::1], {ROWS}, {ROWS}, {ROWS}, {GRID}, {FIELD}, float32[:,:,::1]")
 def shadows(
     kinds: Any, numbers: Any, constants: Any, heights: Any, grid: Any, field: Any, parts: Any
 ) -> None:
@@ -216,7 +215,7 @@ def shadows(
                 distance[pixel] = _segment(distance[pixel])
 
 
-@_loop(f"{ROWS}, {GRID}, float32, float32[:,:,::1], float32[:,:,::1], {FIELD}")
+@partial(_loop, f"{ROWS}, {GRID}, float32, float32[:,:,::1], float32[:,:,::1], {FIELD}")
 def lamps(heights: Any, grid: Any, near: Any, places: Any, colors: Any, out: Any) -> None:
     """Add up cos / distance² of small lamps, times their squared heights. Far lamps are at 0."""
     x, y, rows, row_slopes, columns, column_slopes = grid
@@ -246,7 +245,7 @@ def lamps(heights: Any, grid: Any, near: Any, places: Any, colors: Any, out: Any
                     shown[pixel] += color * field[pixel]
 
 
-@_loop(f"{FIELD}, {GRID}, {FIELD}, {FIELD}")
+@partial(_loop, f"{FIELD}, {GRID}, {FIELD}, {FIELD}")
 def multiply_slides(log_gain: Any, grid: Any, shading: Any, slides: Any) -> None:
     """Multiply slides by their shading and by the exponential of interpolated logarithms."""
     # Weights of the nodes of the grid at each row and each column of the image.

@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import Any
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -374,6 +375,12 @@ class Example:
     cameras: tuple[Camera, ...]
     background: int
     exposure: float = 1.0
+
+
+def with_field(examples: Sequence[Example], name: str, values: Iterable[Any]) -> list[Example]:
+    """Return copies of examples, each with its own value of a field."""
+    pairs = zip(examples, values, strict=True)
+    return [replace(example, **{name: value}) for example, value in pairs]
 
 
 @dataclass(frozen=True, repr=False)

@@ -527,21 +527,18 @@ class DirectRenderer:
         is not close to the shape, the shape that was kept for the example is tried. If that is not
         close either, shadows and bounces of the new shape are computed.
         """
-        item = self.objects[object_index]
+        item, kept = self.objects[object_index], self._transports
 
-        def trace(mesh: Mesh) -> FrozenTransport:
-            return FrozenTransport(mesh, self.settings, item.albedo_scale, self.basis)
+        def traced(key: int | tuple[int, int], mesh: Mesh) -> FrozenTransport:
+            if key not in kept or not kept[key].is_near(mesh.vertices):
+                kept[key] = FrozenTransport(mesh, self.settings, item.albedo_scale, self.basis)
+            return kept[key]
 
-        kept = self._transports
         # The light paths of the unmoved mesh are traced once.
-        if object_index not in kept:
-            kept[object_index] = trace(item.mesh)
-        if kept[object_index].is_near(positions):
-            return kept[object_index]
-        key = (example, object_index)
-        if key not in kept or not kept[key].is_near(positions):
-            kept[key] = trace(replace(item.mesh, vertices=positions))
-        return kept[key]
+        unmoved = traced(object_index, item.mesh)
+        if unmoved.is_near(positions):
+            return unmoved
+        return traced((example, object_index), replace(item.mesh, vertices=positions))
 
     def _rasterized(self, group: Group, settings: ImageSettings) -> tuple[Fragments, Tensor]:
         """Find the samples that the cameras of a group see, and their albedo (S, 3)."""

@@ -253,17 +253,17 @@ class Scene:
         The first objects get one more if the number does not divide. The examples of an object
         are repeated if there are too few.
         """
-        # Indices of the examples of each object.
-        of_object: list[list[int]] = [[] for _ in self.objects]
-        for row, example in enumerate(self.examples):
-            of_object[example.object].append(row)
         rows: list[int] = []
-        for index, rows_of_object in enumerate(of_object):
-            share = count // len(of_object) + (index < count % len(of_object))
-            rows += islice(cycle(rows_of_object), share)
+        for index in range(len(self.objects)):
+            share = count // len(self.objects) + (index < count % len(self.objects))
+            rows += islice(cycle(self.rows_of(index)), share)
         if rows == [*range(len(self))]:
             return self
         return self.changed(examples=[self.examples[row] for row in rows], lights=self.lights[rows])
+
+    def rows_of(self, item: int) -> list[int]:
+        """Return the indices of the examples that show an object."""
+        return (self.object_of == item).nonzero()[:, 0].tolist()
 
     def __len__(self) -> int:
         return len(self.examples)

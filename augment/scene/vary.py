@@ -15,7 +15,14 @@ from torch import Generator, Tensor
 from augment.augmentation_settings import CameraEffectSettings, VariationSettings
 from augment.progress import progress
 from augment.scene import patterns
-from augment.scene.objects import Example, SceneObject, resample_instance, rotated, with_own_mesh
+from augment.scene.objects import (
+    Example,
+    SceneObject,
+    resample_instance,
+    rotated,
+    with_field,
+    with_own_mesh,
+)
 from augment.scene.scene import Scene
 from augment.scene.surfaces import between
 from augment.scene.tabletop import Room, above_table, irradiance, project_along_light
@@ -88,7 +95,7 @@ class _Variation:
         if settings.backgrounds is not None:
             files = settings.backgrounds, "backgrounds", len(scene), scene.settings.size
             changed["backgrounds"] = _draw_image_files(*files, self.draws)
-            examples = _number_backgrounds(examples)
+            examples = with_field(examples, "background", range(len(examples)))
         if settings.instances or settings.rotation or any(settings.gloss.specular_factor):
             # Examples of the same object and the same cameras get the same random object. They
             # differ in their backgrounds only.
@@ -96,10 +103,7 @@ class _Variation:
             pair_to_new_object = {pair: index for index, pair in enumerate(dict.fromkeys(pairs))}
             objects = [scene.objects[object_index] for object_index, _ in pair_to_new_object]
             changed["objects"] = self._draw_objects(objects)
-            examples = [
-                replace(example, object=pair_to_new_object[pair])
-                for example, pair in zip(examples, pairs, strict=True)
-            ]
+            examples = with_field(examples, "object", [pair_to_new_object[pair] for pair in pairs])
         # Direct rendering of a view in one lighting is faster than the construction of its transfer
         # operator, except if direct rendering would trace rays.
         one_light = scene.one_light or (once and settings.moves and not scene.needs_rays)
@@ -155,11 +159,9 @@ class _Variation:
     def change_lighting(self) -> Scene:
         """Return a copy of the scene with random lighting and random effects of the camera."""
         scene, settings = self.scene, self.settings
-        exposures = self._draw_log_uniform(settings.exposure)
-        examples = [
-            replace(example, exposure=example.exposure * factor)
-            for example, factor in zip(scene.examples, exposures, strict=True)
-        ]
+        pairs = zip(scene.examples, self._draw_log_uniform(settings.exposure), strict=True)
+        exposures = [example.exposure * factor for example, factor in pairs]
+        examples = with_field(scene.examples, "exposure", exposures)
         environment, directions = self._draw_lights()
         # Projector and lamps stay the same.
         local = scene.lights[:, environment.shape[1] :]
@@ -182,7 +184,7 @@ class _Variation:
             backgrounds = lit._light_backgrounds(albedo, environment, directions)
             changed["backgrounds"], pattern_points = backgrounds
             # Each example now has a background of its own.
-            examples = _number_backgrounds(examples)
+            examples = with_field(examples, "background", range(len(examples)))
         if settings.camera != CameraEffectSettings():
             drawn = len(scene), scene.settings, self.draws, scene.lights.device, pattern_points
             changed["camera_effects"] = draw_camera_effects(settings.camera, *drawn)
@@ -302,11 +304,6 @@ class _Variation:
         """Draw a pair of numbers for each example uniformly from [-limit, limit]."""
         fractions = torch.rand(len(self.scene), 2, generator=self.draws, dtype=torch.float64)
         return (limit * (2 * fractions - 1)).tolist()
-
-
-def _number_backgrounds(examples: Sequence[Example]) -> list[Example]:
-    """Return copies of examples, in which example i refers to background i."""
-    return [replace(example, background=index) for index, example in enumerate(examples)]
 
 
 def _towards_cameras(cameras: Sequence[Camera]) -> Float[Tensor, "E 3"]:

@@ -33,12 +33,12 @@ from augment.classifier import TaskNetwork
 from augment.network import compute_outputs, device_of
 from augment.progress import progress
 from augment.random_streams import generator
-from augment.scene.build import build_local_light
+from augment.scene.build import build_lights
 from augment.scene.objects import Conditions, SceneObject
 from augment.scene.scene import Scene
 from augment.scene.truth import NO_OBJECT, Truth
 from augment.scene.vary import vary
-from augment.settings import LOCAL_LIGHT_SETTINGS
+from augment.settings import SceneSettings
 from augment.tasks.detection import Detection
 from augment.tasks.task import Criterion
 from renderer.camera import orbit_cameras
@@ -46,7 +46,7 @@ from renderer.errors import MAX_SCALE
 from renderer.image import to_bytes, to_unit
 from renderer.io.files import write_numbers
 from renderer.io.images import encode_image
-from renderer.light.basis import HARMONICS, with_local_lights
+from renderer.light.basis import HARMONICS
 from renderer.light.files import UNIFORM, load_light, perturb
 from renderer.rendering import light_sphere
 from renderer.settings import ImageSettings, Size, height_and_width
@@ -177,10 +177,8 @@ class Views:
         """Build a scene with one example for each view."""
         # The views show the objects in turn.
         objects = [self.objects[index % len(self.objects)] for index in range(self.count)]
-        is_local = kind in LOCAL_LIGHT_SETTINGS
-        local_lights = [build_local_light(LOCAL_LIGHT_SETTINGS[kind]())] if is_local else []
-        natural_light = load_light(self.light) * self.exposure
-        basis, lights = with_local_lights(natural_light, local_lights)
+        of_scene = SceneSettings(exposure=self.exposure).with_lights([kind])
+        basis, lights = build_lights(of_scene, load_light(self.light))
         # A gray background, shape (1, 1, H, W).
         background = torch.full((1, 1, *height_and_width(size)), BACKGROUND)
         settings = ImageSettings(size, samples=2, encoding="srgb", normals="smooth")

@@ -14,7 +14,7 @@ from augment.attacks.parameters.parameter import Parameter
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from renderer.errors import InputError
-from renderer.light.basis import HARMONICS, Part
+from renderer.light.basis import HARMONICS
 from renderer.light.files import mean_luminance
 from renderer.light.lamps import LOCAL_LIGHTS
 from renderer.light.ringing import nonnegative_window
@@ -24,18 +24,35 @@ from renderer.settings import TURBIDITY
 from renderer.vectors import Ball
 
 
-class LightParameter(Parameter):
-    """Attack on all RGB coefficients of one light, such as the environment or the projector.
+class Light(Parameter):
+    """Attack on all RGB coefficients of one light: the environment, a projector or lamps.
+
+    Those of the environment are spherical-harmonic coefficients. Those of a projector are its
+    pixels, and those of lamps their powers, between 0 and the power of the light.
 
     The attack starts at the light of the scene. If radiance must not be
     negative, the start is the nearest light without negative radiance that has
     the same mean. Each step then ends in the nearest coefficients that lie in
     the norm-ball and have no negative radiance.
+
+    Args:
+        scene: Scene to attack. Its other lights stay as they are.
+        settings: Norm-ball and steps of the attack.
+        name: "lighting" for the environment, or the name of a local light.
+        nonnegative: Whether radiance must not be negative in any direction. That of local lights
+            never is.
     """
 
-    def __init__(self, scene: Scene, settings: StepSettings, light: Part, nonnegative: bool):
-        """Compute the values of the light of the scene at which the attack starts."""
-        self._rows, self._basis = light
+    def __init__(self, scene: Scene, settings: StepSettings, name: str, nonnegative: bool = False):
+        """Find the light in the scene, and compute the values at which the attack starts."""
+        self.name = name
+        # The environment is the first light of a scene.
+        lights = {"lighting": scene.basis.lights[0]}
+        lights |= {light.basis.name: light for light in scene.basis.local_lights}
+        if name not in lights:
+            fault = f"{name} cannot be attacked, because the scene has none"
+            raise InputError(f"{fault}: build the scene with {name}=...", name)
+        self._rows, self._basis = lights[name]
         self._nonnegative = nonnegative or not self._basis.allow_negative
         initial_light = scene.lights[:, self._rows]
         if self._nonnegative:
@@ -72,38 +89,6 @@ def replace_light(
     before = all_lights[:, : rows.start]
     after = all_lights[:, rows.stop :]
     return replace(conditions, light=torch.cat([before, coefficients, after], dim=1))
-
-
-class Lighting(LightParameter):
-    """Attack on the spherical-harmonic coefficients of the environment lighting.
-
-    Args:
-        scene: Scene to attack. Its projector and lamps stay as they are.
-        settings: Norm-ball and steps of the attack.
-        nonnegative: Whether radiance must not be negative in any direction.
-    """
-
-    name = "lighting"
-
-    def __init__(self, scene: Scene, settings: StepSettings, nonnegative: bool = False):
-        # The environment is the first light of a scene.
-        super().__init__(scene, settings, scene.basis.lights[0], nonnegative)
-
-
-class LocalLight(LightParameter):
-    """Attack on the RGB coefficients of a projector (its pixels) or of lamps (their powers).
-
-    A coefficient lies between 0 and the power of the light.
-    """
-
-    def __init__(self, scene: Scene, settings: StepSettings, name: str):
-        """Find the light among the local lights of the scene."""
-        self.name = name
-        lights = {light.basis.name: light for light in scene.basis.local_lights}
-        if name not in lights:
-            fault = f"{name} cannot be attacked, because the scene has none"
-            raise InputError(f"{fault}: build the scene with {name}=...", name)
-        super().__init__(scene, settings, lights[name], nonnegative=True)
 
 
 # An attack on a daylight sky changes three values: two angles of the sun, and the turbidity (haze)

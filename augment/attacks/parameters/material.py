@@ -96,9 +96,8 @@ class Material(Parameter):
         The columns of the values are average roughness, metallic factor and specular factor, and
         the rotation of the hue, each divided by its unit.
         """
-        if self.used_mask is not None:
-            # Values that are not attacked keep their start.
-            values = torch.where(self.used_mask[examples], values, self.start[examples])
+        # Values that are not attacked keep their start.
+        values = torch.where(self.used_mask[examples], values, self.start[examples])
         material = values * self._unit
         objects = self._object_of[examples]
         # Columns `GLOSS` are the three factors, and column `HUE` is the rotation.

@@ -52,9 +52,7 @@ class MeshParameter(Parameter):
 
         The vectors of unused vertices or faces are zero.
         """
-        if self.used_mask is not None:
-            values = values * self.used_mask[examples]
-        return values.unflatten(1, (-1, 3))
+        return (values * self.used_mask[examples]).unflatten(1, (-1, 3))
 
 
 class Geometry(MeshParameter):

@@ -24,7 +24,7 @@ from augment.attack_settings import (
 from augment.attacks import loop
 from augment.attacks.loop import Minimum, minimize
 from augment.attacks.objective import Objective
-from augment.attacks.optimizers import NormBalls, sample
+from augment.attacks.optimizers import NormBalls
 from augment.tasks.classification import ClassCriterion
 
 EPS = torch.finfo(torch.float64).eps
@@ -100,7 +100,7 @@ def test_the_lowest_point_of_a_ball_is_found_from_anywhere_in_it(optimizer, norm
     step = "unit" if norm == "l2" else "sign"
     ball = StepSettings(norm, 0.4, step, step_size=0.3)
     center = draw(3, VALUE_COUNT, seed=2)
-    start = sample(ball, center, torch.Generator().manual_seed(0))
+    start = NormBalls(ball, center).draw(torch.Generator().manual_seed(0))
     # With a target, the cost is the sum of the leads of all views, which is linear in the values.
     views = 2
     zeros = torch.zeros(3, views, dtype=torch.int64)
@@ -469,7 +469,8 @@ def test_restarts_go_on_with_the_examples_without_success_and_keep_the_first_suc
     steps = StepSettings("linf", 0.5, "sign", 0.1)
     criterion = ClassCriterion(torch.arange(40)[:, None] % 2)
     settings = settings_of(2, sensor_noise=0.0)
-    starts = [sample(steps, center, torch.Generator().manual_seed(seed)) for seed in (4, 5)]
+    balls = NormBalls(steps, center)
+    starts = [balls.draw(torch.Generator().manual_seed(seed)) for seed in (4, 5)]
     problem = LinearScene(center, steps)
     result = descend(Linear(), problem, criterion, settings, restarts=starts)
     single = []

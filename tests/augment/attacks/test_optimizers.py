@@ -12,7 +12,7 @@ from scipy import optimize, stats
 from torch import Tensor
 
 from augment.attack_settings import NORMS, StepSettings
-from augment.attacks.optimizers import NormBalls, sample
+from augment.attacks.optimizers import NormBalls
 from renderer.vectors import Ball, nearest_in_box
 
 EPS = torch.finfo(torch.float32).eps
@@ -102,7 +102,7 @@ def test_draws_are_uniform_in_the_ball(name, dimensions):
     """(norm / radius)^D is uniform, and variances are radius² / 3 or radius² / (D + 2)."""
     radius = 0.3
     center = torch.linspace(-1, 1, dimensions, dtype=torch.float64).expand(DRAW_COUNT, -1)
-    drawn = sample(StepSettings(name, radius), center, torch.Generator().manual_seed(1))
+    drawn = NormBalls(StepSettings(name, radius), center).draw(torch.Generator().manual_seed(1))
     offsets = (drawn - center) / radius
     lengths = norms(offsets, name)
     assert lengths.max() <= 1 + 1e-6  # Draws are in float32.
@@ -122,7 +122,7 @@ def test_draws_along_some_axes_are_uniform_in_the_ball_of_these_axes(name):
     is_used[0] = False
     center = torch.zeros(DRAW_COUNT, 5)
     draws = torch.Generator().manual_seed(1)
-    drawn = sample(StepSettings(name, 1.0), center, draws, is_used)
+    drawn = NormBalls(StepSettings(name, 1.0), center, is_used).draw(draws)
     assert not drawn[~is_used].any()
     assert stats.kstest(norms(drawn[1:], name).numpy() ** 2, "uniform").pvalue > 0.01
     without_radius = NormBalls(StepSettings(name), center, is_used).sample(draws, center + is_used)

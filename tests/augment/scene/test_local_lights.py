@@ -12,13 +12,12 @@ from augment.attack_settings import StepSettings
 from augment.attacks.adversary import Adversary, reload, write_adversary
 from augment.attacks.parameters import make_parameter
 from augment.attacks.problem import SceneProblem
-from augment.scene.build import build_local_light
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
 from augment.settings import LOCAL_LIGHT_SETTINGS, LampsSettings, ProjectorSettings
 from renderer.errors import InputError
 from renderer.light.files import read_light, save_light
-from renderer.light.lamps import LOCAL_LIGHTS
+from renderer.light.lamps import LOCAL_LIGHTS, Lamps, Projector
 from renderer.visibility import choose
 from tests.helpers import by_channel
 
@@ -44,7 +43,7 @@ def rendered(shown: Scene, conditions: Conditions | None = None) -> Tensor:
 
 @pytest.mark.parametrize("kind", LOCAL_LIGHTS.values())
 def test_each_kind_of_local_light_is_read_back_from_its_file(kind, tmp_path):
-    basis, _ = build_local_light(LOCAL_LIGHT_SETTINGS[kind.name]())
+    basis, _ = kind.from_settings(LOCAL_LIGHT_SETTINGS[kind.name]())
     coefficients = torch.rand(basis.size, 3, generator=torch.Generator().manual_seed(0))
     save_light(tmp_path / "light.json", coefficients, basis)
     found, values = read_light(tmp_path / "light.json", *LOCAL_LIGHTS.values())
@@ -132,14 +131,14 @@ def test_positions_of_other_lamps_than_those_of_the_scene_are_refused(wrong):
 def test_an_attacked_pattern_is_written_as_an_image_and_moved_lamps_where_they_ended(joint_attack):
     done, written, folder = joint_attack
     image = str(folder / "projector.png")
-    projector, pattern = build_local_light(ProjectorSettings(6, power=2.0, pattern=image))
+    projector, pattern = Projector.from_settings(ProjectorSettings(6, power=2.0, pattern=image))
     expected = written.light[49 : 49 + 6**2]
     torch.testing.assert_close(pattern, expected, rtol=0, atol=projector.power / 255)
-    lamps, powers = build_local_light(LampsSettings(start=str(folder / "lamps.json")))
+    lamps, powers = Lamps.from_settings(LampsSettings(start=str(folder / "lamps.json")))
     assert torch.equal(torch.tensor(lamps.positions), done.conditions.positions[0])
     assert torch.equal(powers, written.light[-len(powers) :])
     with pytest.raises(InputError, match=r"projector\.json"):
-        build_local_light(LampsSettings(start=str(folder / "projector.json")))
+        Lamps.from_settings(LampsSettings(start=str(folder / "projector.json")))
 
 
 def test_mitsuba_renders_a_joint_attack_alike(joint_attack):

@@ -20,7 +20,7 @@ from augment.attacks.problem import SceneProblem
 from augment.augmentation_settings import VariationSettings, views_of
 from augment.network import say_once
 from augment.scene import render
-from augment.scene.build import build_local_light, build_scene, warn_of_exposure
+from augment.scene.build import build_scene, warn_of_exposure
 from augment.scene.objects import Conditions, Example, load_object
 from augment.scene.render import NEAR
 from augment.scene.scene import Scene
@@ -29,6 +29,7 @@ from augment.settings import LampsSettings, ObjectSettings, ProjectorSettings
 from renderer.camera import orbit_cameras
 from renderer.light.environment import to_map, write_map
 from renderer.light.files import ambient, probe
+from renderer.light.lamps import Projector
 from renderer.operators.build import build_operators
 from renderer.settings import ImageSettings
 from renderer.visibility import choose
@@ -104,7 +105,7 @@ def test_the_automatic_exposure_leaves_the_projector_within_its_power_and_its_ra
     mask = scene.truth(lambda label: 0).masks[0, 0, 0]
     assert float(images[0][:, mask].mean()) == pytest.approx(0.4, abs=1e-3)
     assert scene.examples[0].exposure > 2
-    _, start = build_local_light(projector)
+    _, start = Projector.from_settings(projector)
     problem = SceneProblem(scene, [make_parameter("projector", scene, StepSettings("linf", 0.5))])
     values = problem.project(problem.start + 9.0, FIRST)
     conditions = problem.conditions(values, FIRST)
