@@ -31,7 +31,7 @@ from augment.random_streams import generator, seeded, stream_seed
 from augment.scene import loops
 from augment.scene.lights import MODELS, Drawn, Illumination, LightModel, LowLight, normal_noise
 from augment.scene.loops import BIN_BITS, BINS
-from augment.scene.patterns import by_kind, draw_projected_light, luminance, require_photographs
+from augment.scene.patterns import as_photographs, by_kind, draw_projected_light, luminance
 from renderer import errors
 from renderer.errors import InputError
 from renderer.image import OVERSHOOT, decode, encode, to_bytes, to_unit
@@ -251,10 +251,10 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
 
 @without_autocast
 def relight_photographs(
-    photographs: Tensor,
+    photographs: Tensor | np.ndarray,
     seed: int = 0,
     *,
-    slides: Tensor | None = None,
+    slides: Tensor | np.ndarray | None = None,
     lights: Sequence[str | LightModel] | None = None,
     strength: float = 1.0,
 ) -> Tensor:
@@ -298,9 +298,9 @@ def relight_photographs(
             return RandomLighting(lights, strength=strength)(photographs)
     if strength != 1.0:
         raise InputError("strength is not used without lights: give lights", "strength")
-    require_photographs("photographs", photographs)
+    photographs = as_photographs("photographs", photographs)
     if slides is not None:
-        require_photographs("slides", slides)
+        slides = as_photographs("slides", slides)
     count, _, *shape = photographs.shape
     # Photographs stand for the albedo, and the light of the projector multiplies it.
     with _usual_defaults():

@@ -15,6 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Generator, Tensor
@@ -27,7 +28,7 @@ from augment.attacks.optimizers import NormBalls, Optimizer
 from augment.classifier import MAX_PROBED, UNIT_RANGE, Normalization, TaskNetwork, as_network
 from augment.progress import progress
 from augment.random_streams import generator
-from augment.scene.patterns import ProjectedLight, draw_projected_light, require_photographs
+from augment.scene.patterns import ProjectedLight, as_photographs, draw_projected_light
 from augment.tasks.task import Criterion, Task
 from renderer import errors
 from renderer.errors import InputError
@@ -193,7 +194,7 @@ class PhotographAttackResult(errors.ShortRepr):
 @torch.inference_mode(False)  # Attacks need autograd.
 def attack_photographs(
     network: TaskNetwork | Callable[[Tensor], Any],
-    photographs: Tensor,
+    photographs: Tensor | np.ndarray,
     settings: RelightingSettings | None = None,
     *,
     classes: Sequence[str] | None = None,
@@ -256,7 +257,7 @@ def attack_photographs(
         >>> result.kept("adversarial").float().mean()  # doctest: +SKIP
         tensor(0.4100)
     """
-    require_photographs("photographs", photographs)
+    photographs = as_photographs("photographs", photographs)
     settings = RelightingSettings.or_default("settings", settings)
     errors.require_whole("seed", seed)
     if limit is not None:

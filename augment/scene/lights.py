@@ -173,7 +173,8 @@ class ProjectedSlide(LightModel):
 
     def __post_init__(self) -> None:
         if self.slides is not None:
-            patterns.require_photographs("slides", self.slides)
+            slides = patterns.as_photographs("slides", self.slides)
+            object.__setattr__(self, "slides", slides)
 
     def light(self, drawn: Drawn) -> Illumination:
         """Project a picture of its own on each image."""

@@ -357,13 +357,15 @@ STOPS = (-1.0, 0.5)
 DARKEST = 1e-6
 
 
-def require_photographs(name: str, photographs: Tensor) -> None:
-    """Check that a value is a tensor of photographs of 8 bits."""
-    require_kind(name, photographs, Tensor, "a tensor of photographs, uint8")
+def as_photographs(name: str, given: Tensor | np.ndarray) -> UInt8[Tensor, "N 3 H W"]:
+    """Check that a value has photographs of 8 bits, and return them as a tensor."""
+    require_kind(name, given, Tensor | np.ndarray, "a tensor or an array of photographs, uint8")
+    photographs = given if isinstance(given, Tensor) else torch.from_numpy(given)
     shape = tuple(photographs.shape)
     if photographs.dtype != torch.uint8 or len(shape) != 4 or shape[1] != 3 or not all(shape):
         fault = f"{name} is {str(photographs.dtype).removeprefix('torch.')} of shape {shape}"
         raise InputError(f"{fault}: give uint8 of shape (N, 3, height, width)")
+    return photographs
 
 
 class ProjectedLight(NamedTuple):

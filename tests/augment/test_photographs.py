@@ -74,7 +74,8 @@ def test_a_gain_of_one_changes_nothing_more_than_the_slide(photographs):
 def test_photographs_are_attacked_alike_in_inference_mode(result, photographs):
     network = HueNetwork().eval()
     with torch.inference_mode():
-        again = attack_photographs(network, photographs.clone(), SETTINGS, seed=1)
+        # An array is taken like a tensor.
+        again = attack_photographs(network, photographs.numpy(), SETTINGS, seed=1)
     for light, changed in result.changed.items():
         assert torch.equal(again.changed[light], changed)
 
@@ -188,6 +189,8 @@ def test_the_gradient_of_the_gain_agrees_with_finite_differences():
 def test_relit_photographs_repeat_with_their_seed(photographs):
     first = relight_photographs(photographs, seed=1, slides=photographs)
     again = relight_photographs(photographs, seed=1, slides=photographs)
+    array = photographs.numpy()
+    assert torch.equal(relight_photographs(array, seed=1, slides=array), first)
     other = relight_photographs(photographs, seed=2, slides=photographs)
     assert first.dtype == torch.uint8
     assert torch.equal(first, again)

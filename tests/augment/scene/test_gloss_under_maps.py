@@ -24,7 +24,7 @@ SIZE = 32
 SETTINGS = ImageSettings(SIZE, 2)
 ALBEDO = 0.5
 AT_ONCE = 32  # samples in the quadrature, which bounds the memory
-ERRORS = {"city": 0.1, "forest": 0.1, "night": 0.1, "studio": 0.3}  # largest by map
+ERRORS = {"city": 0.1, "forest": 0.1, "night": 0.1, "studio": 0.32}  # largest by map
 BLACK = 0.005  # largest fraction of the channels of lit pixels that are black
 METALLIC = {"varnish": 0.0, "metal": 1.0}
 
@@ -92,7 +92,7 @@ def require_close(path: Path, largest_error: float, roughness: float, metallic: 
 
 @pytest.mark.realdata
 @pytest.mark.slow
-@pytest.mark.parametrize("roughness", [0.2, 0.25, 0.3, 0.35, 0.4, 0.5])
+@pytest.mark.parametrize("roughness", [0.2, 0.25, 0.3, 0.335, 0.35, 0.4, 0.5])
 @pytest.mark.parametrize("gloss", METALLIC)
 @pytest.mark.parametrize("name", ERRORS)
 def test_gloss_is_that_of_the_full_map_and_hardly_any_lit_pixel_is_black(name, roughness, gloss):
