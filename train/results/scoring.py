@@ -212,10 +212,9 @@ class Scores(ShortRepr):
         A Markdown table has a row for each metric of all images, with its 95% interval. The metrics
         in `DETAILS` are left out.
         """
-        rows = []
-        for name in (*_fraction_metrics(self), *RANKING_METRICS):
-            if name not in DETAILS:
-                rows.append((TITLES[name], _format_metric(self.overall.find(name))))
+        names = [*_fraction_metrics(self), *RANKING_METRICS]
+        shown_names = [name for name in names if name not in DETAILS]
+        rows = [(TITLES[name], _format_metric(self.overall.find(name))) for name in shown_names]
         shown = (self.overall.recall, self.overall.false_positive_rate, self.overall.auc)
         title = f"{_count_images(self)}; {tables.describe_intervals(shown)}"
         return "\n".join([str(Table(title, ["metric", self.label], rows)), *_notes(self)])
@@ -345,9 +344,9 @@ def write(scores: Scores, out: Path) -> None:
     sheet = contact_sheet(predicted.predictions, predicted.images.numpy())
     write_image(out / predictions.CONTACT_SHEET, sheet)
     groups = scores.pooled.groups("label" if len(predicted.labels) > 1 else "source")
-    # The log-odds of positives and negatives of each group.
-    curves = {name: pool.scores for name, pool in groups.items()}
-    write_roc(out, scores.pooled.all.scores, curves, scores.label)
+    # The log-odds of positives and negatives of all photographs, and of each group.
+    pools = {"": scores.pooled.all, **groups}
+    write_roc(out, {name: pool.scores for name, pool in pools.items()}, scores.label)
     predictions.write_summary(out, scores.to_summary())
 
 
@@ -386,15 +385,10 @@ def choose_operating_points(
 def format_scores(scores: Scores) -> str:
     """Format scores as Markdown tables, with a row for each label and each source or mesh."""
     names = [*_fraction_metrics(scores), *RANKING_METRICS]
-    rows = []
-    # All estimates of the table. Its title says over what their intervals are.
-    shown: list[Estimate | None] = []
     groups = [("all", scores.overall), *scores.by_label.items(), *scores.groups.items()]
-    for title, of_group in groups:
-        estimates = [of_group.find(name) for name in names]
-        shown += estimates
-        rows.append([title, *map(_format_metric, estimates)])
-    table = Table(tables.describe_intervals(shown), ["", *(TITLES[name] for name in names)], rows)
+    rows = [[title, *map(of_group.find, names)] for title, of_group in groups]
+    header = ["", *(TITLES[name] for name in names)]
+    table = tables.table_of("", header, rows, _format_metric)
     parts = [_count_images(scores), table, _class_table(scores), *_notes(scores)]
     return "\n\n".join(map(str, parts))
 
