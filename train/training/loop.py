@@ -155,15 +155,6 @@ class TrainingStep:
         self.scaler.update()
         return torch.stack([loss.detach() * len(images), hits])
 
-    def state_dict(self) -> dict[str, Any]:
-        """Return the states of the optimizer and of the gradient scaler for a checkpoint."""
-        return {"optimizer": self.optimizer.state_dict(), "scaler": self.scaler.state_dict()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore the optimizer and the gradient scaler from a checkpoint."""
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.scaler.load_state_dict(state["scaler"])
-
 
 @dataclass(eq=False)
 class Trainer:
@@ -421,7 +412,8 @@ class Trainer:
         return {
             **self._description(),
             "model": self.model.network.state_dict(),
-            **self.step.state_dict(),
+            "optimizer": self.step.optimizer.state_dict(),
+            "scaler": self.step.scaler.state_dict(),
             **self.averages.state_dict(),
             "precision": self.model.precision,
             "service": self.service.state_dict(),
@@ -438,7 +430,8 @@ class Trainer:
         self.epoch = state["epoch"]
         self.history = state["history"]
         self.model.network.load_state_dict(state["model"])
-        self.step.load_state_dict(state)
+        self.step.optimizer.load_state_dict(state["optimizer"])
+        self.step.scaler.load_state_dict(state["scaler"])
         self.averages.load_state_dict(state)
         for network in (self.model, self.initial, self.selected):
             if network:
@@ -487,15 +480,14 @@ def evaluate(model: nn.Module, split: Split) -> dict[str, float]:
     """
     device = split.labels.device
     # Each of n processes scores every n-th image.
-    own = slice(distributed.rank(), None, distributed.world_size())
-    own_rows = torch.arange(len(split), device=device)[own]
-    batches = own_rows.split(EVALUATION_BATCH)
+    rows = torch.arange(len(split), device=device)[distributed.rank() :: distributed.world_size()]
+    batches = rows.split(EVALUATION_BATCH)
     sums = torch.zeros(2, device=device)
     # With few images, a process has none, and not every network takes an empty batch.
-    if len(own_rows):
+    if len(rows):
         shown = progress(split.squares(batches), f"{len(split)} images", len(batches))
         logits = compute_outputs(model, shown, EVALUATION_BATCH, device)
-        labels = split.labels[own_rows]
+        labels = split.labels[rows]
         loss_sum = F.cross_entropy(logits, labels, reduction="sum")
         sums = torch.stack([loss_sum, (logits.argmax(1) == labels).sum()])
     loss_sum, hits = all_reduce_sum(sums).tolist()
