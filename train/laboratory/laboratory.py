@@ -400,8 +400,7 @@ def write_laboratory(settings: LabSettings) -> int:
         write_csv(out / TABLE, [COLUMNS, *sorted(rows)], line_end="\r\n")
         versions = {"python": platform.python_version()}
         versions |= {name: version(name) for name in PACKAGES}
-        description = {**asdict(settings), "versions": versions}
-        write_json(out / DESCRIPTION, description, indent=2)
+        write_json(out / DESCRIPTION, {**asdict(settings), "versions": versions}, indent=2)
         return len(rows)
 
 
