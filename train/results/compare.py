@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 from train.results import store, tables
 from train.results.intervals import Jackknife, change
-from train.results.metrics import COUNTED_EACH, METRICS, TITLES, TOP_RANKS, Pool, Pooled
+from train.results.metrics import COUNTED_EACH, METRICS, TITLES, TOP_RANKS, Pool
 from train.results.predictions import PREDICTIONS
 from train.results.store import INITIAL, Methods, RunSummary, Scored, ScoredRun
 from train.results.tables import Estimate, Table, format_interval, table_of
@@ -53,7 +53,7 @@ class Evaluation(NamedTuple):
     """Predictions of the network of a run for one folder of photographs, in groups."""
 
     run: RunSummary
-    pooled: Pooled
+    pooled: Pool
 
     def rows(self, *properties: str) -> list[Subset]:
         """List the rows of a table: all images, several positive classes, and subsets."""

@@ -31,7 +31,7 @@ from train.data import photographs as folders
 from train.data.photo import TABLE, Photograph
 from train.results import metrics, predictions, tables
 from train.results.intervals import thresholds
-from train.results.metrics import TITLES, Metrics, Outcome, Pooled
+from train.results.metrics import TITLES, Metrics, Outcome, Pool
 from train.results.pictures import contact_sheet, write_roc
 from train.results.predictions import Predictions
 from train.results.tables import Estimate, Proportion, Table
@@ -202,7 +202,7 @@ class Scores(ShortRepr):
     """
 
     predicted: FolderPredictions
-    pooled: Pooled
+    pooled: Pool
     points: Sequence[OperatingPoint]
     by: str
 
@@ -227,7 +227,7 @@ class Scores(ShortRepr):
     @property
     def overall(self) -> Metrics:
         """Metrics of all photographs. With several labels, one counts once for each label."""
-        return self.pooled.all.metrics
+        return self.pooled.metrics
 
     @cached_property
     def by_label(self) -> dict[str, Metrics]:
@@ -287,8 +287,8 @@ class Scores(ShortRepr):
             **self.overall.to_summary(),
             "n": {
                 "photographs": len(predicted.images),
-                "positives": len(self.pooled.all.positives),
-                "negatives": len(self.pooled.all.negatives),
+                "positives": len(self.pooled.positives),
+                "negatives": len(self.pooled.negatives),
                 "unreadable": len(predicted.unreadable),
                 "left_out": len(predicted.left_out),
             },
@@ -325,7 +325,7 @@ def score(
     if by == "mesh" and not any(item.mesh for item in predicted.predictions.photograph):
         fault = f"by=mesh, but {predicted.folder} has no {TABLE} with a column mesh"
         raise InputError(f"{fault}: add this table, or remove by=mesh")
-    pooled = Pooled(predicted.predictions, {point.label: point.threshold for point in points})
+    pooled = Pool(predicted.predictions, {point.label: point.threshold for point in points})
     return Scores(predicted, pooled, points, by)
 
 
@@ -345,7 +345,7 @@ def write(scores: Scores, out: Path) -> None:
     write_image(out / predictions.CONTACT_SHEET, sheet)
     groups = scores.pooled.groups("label" if len(predicted.labels) > 1 else "source")
     # The log-odds of positives and negatives of all photographs, and of each group.
-    pools = {"": scores.pooled.all, **groups}
+    pools = {"": scores.pooled, **groups}
     write_roc(out, {name: pool.scores for name, pool in pools.items()}, scores.label)
     predictions.write_summary(out, scores.to_summary())
 
@@ -395,8 +395,8 @@ def format_scores(scores: Scores) -> str:
 
 def _count_images(scores: Scores) -> str:
     """Say how many positive and negative images were scored."""
-    positives = len(scores.pooled.all.positives)
-    negatives = len(scores.pooled.all.negatives)
+    positives = len(scores.pooled.positives)
+    negatives = len(scores.pooled.negatives)
     each = metrics.COUNTED_EACH if scores.by_label else ""
     return f"{positives} images of {scores.label}, {negatives} negatives{each}"
 
