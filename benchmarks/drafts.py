@@ -46,11 +46,11 @@ def timed_gradient(image_of, values: Tensor) -> tuple[float, Tensor, Tensor]:
 
 def read(words: list[str]) -> tuple[AttackExperimentSettings, Classifier, SceneProblem]:
     """Return the settings, the network and the attacked scene."""
-    settings = main.read(words)
+    settings = main.read([*words, "device=cpu"])
     item = read_object(settings.meshes[0], "", "meshes[0]")
     item.label = settings.label
     network = load_chosen(settings)
-    scene = build_attacked(settings, item, settings.scene, network.size, torch.device("cpu"))
+    scene = build_attacked(settings, item, settings.scene, network.size)
     return settings, network, build_problem(settings.attack, scene)
 
 

@@ -31,7 +31,7 @@ from train.data.photographs import find_photographs, load_photographs
 from train.laboratory.laboratory import write_laboratory
 from train.results.compare import ALL, Evaluation, difference, mean_metric
 from train.results.intervals import auc_and_recalls
-from train.results.metrics import TITLES, Pooled
+from train.results.metrics import TITLES, Pool
 from train.results.scoring import compute_logits, rank_classes
 from train.results.store import RunSummary
 from train.results.tables import Table, format_interval
@@ -148,7 +148,7 @@ def evaluate(network: Classifier, folder: Path) -> Evaluation:
     """
     photographs, images = read_renders(folder, network.size)
     logits = compute_logits(network, images, len(network.classes), "cpu")
-    pooled = Pooled(rank_classes(photographs, logits, network.classes, [LABEL]))
+    pooled = Pool(rank_classes(photographs, logits, network.classes, [LABEL]))
     summary = RunSummary(folder, network.name, {}, {}, None)
     return Evaluation(summary, pooled)
 
@@ -167,7 +167,7 @@ def mean_auc(
     for network in networks:
         normalizing = network.normalizing_light(light)
         for part in PARTS:
-            pool = evaluate(normalizing, split / part).pooled.all
+            pool = evaluate(normalizing, split / part).pooled
             auc, *_ = auc_and_recalls(*pool.scores)
             areas.append(float(auc))
     print([round(area, 3) for area in areas], flush=True)

@@ -48,7 +48,7 @@ from train.data.sets import Split, content_hash, held_out_rows, load_npz
 from train.device import MixedPrecision, choose_precision
 from train.laboratory.laboratory import write_laboratory
 from train.results.compare import ALL, Evaluation, difference, mean_metric
-from train.results.metrics import METRICS, TITLES, Pooled
+from train.results.metrics import METRICS, TITLES, Pool
 from train.results.predictions import PREDICTIONS, Predictions, write_predictions
 from train.results.scoring import Predictor
 from train.results.store import RunSummary, summarize
@@ -568,7 +568,7 @@ def pool(run: str, network: Classifier, predictions: Predictions) -> Evaluation:
         Evaluation of the run.
     """
     thresholds = {point.label: point.threshold for point in network.operating_points}
-    pooled = Pooled(predictions, thresholds=thresholds)
+    pooled = Pool(predictions, thresholds=thresholds)
     return Evaluation(summarize_network(run), pooled)
 
 

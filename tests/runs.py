@@ -14,7 +14,7 @@ def loaded_run(settings: ExperimentSettings, folder: Path, data: DataSet | None 
     initial = load_initial(settings)
     if data is None:
         data = load_data(settings, initial)
-    run = Run(settings, data, folder, initial)
+    run = Run(settings, data, initial, folder)
     run.begin()
     return run
 

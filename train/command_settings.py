@@ -152,9 +152,7 @@ class AttackExperimentSettings(TaskSettings):
         if self.unlabeled is not None:
             counting = (*OF_RELIGHTING, *OF_NETWORK)
             require_counting(self, AttackExperimentSettings(), counting, "for attack=relighting")
-        self.scene = self.scene.with_lights(attacked)
-        if "pose" in attacked:
-            self.renderer.silhouettes = True
+        common.prepare_attack(self, attacked)
 
 
 def require_counting(given: Any, default: Any, names: Iterable[str], use: str) -> None:
@@ -422,9 +420,7 @@ class RenderSettings(TaskSettings):
         parts = [*self.splits.values()] if isinstance(self.splits, dict) else []
         if not all(is_number(part) and part >= 0 for part in parts) or not sum(parts):
             raise self.wrong("splits", "must be parts and their fractions, such as {train: 1}")
-        self.scene = self.scene.with_lights(self.augment.attack.parameters)
-        if "pose" in self.augment.attack.parameters:
-            self.renderer.silhouettes = True
+        common.prepare_attack(self, self.augment.attack.parameters)
         # The default depends on the network. `require_counting` refuses other modes.
         if self.network and self.augment.mode == "random":
             self.augment.mode = "adversarial"

@@ -80,20 +80,20 @@ def load(name: str) -> PublishedNetwork | PublishedDetector:
     # The scores of a classifier are metrics by name, those of a detector are in groups of images.
     scores = state["scores"]
     facts = loaded.network, loaded.size, loaded.classes, name
+    network: PublishedNetwork | PublishedDetector
     if isinstance(loaded, Classifier):
         network = PublishedNetwork(*facts)
         network.operating_points = loaded.operating_points
-        network.inputs, network.recognizer = loaded.inputs, loaded.recognizer
         network.results = _read_results(scores)
-        return network
-    detector = PublishedDetector(*facts, task=loaded.task)
-    detector.inputs, detector.recognizer = loaded.inputs, loaded.recognizer
-    detector.results = {
-        f"{images}/{metric}": Estimate(**metrics["all"][metric])
-        for images, metrics in scores.items()
-        for metric in ("recall", "ap50", "false_per_image")
-    }
-    return detector
+    else:
+        network = PublishedDetector(*facts, task=loaded.task)
+        network.results = {
+            f"{images}/{metric}": Estimate(**metrics["all"][metric])
+            for images, metrics in scores.items()
+            for metric in ("recall", "ap50", "false_per_image")
+        }
+    network.inputs, network.recognizer = loaded.inputs, loaded.recognizer
+    return network
 
 
 def _read_results(scores: Mapping[str, Any]) -> dict[str, Estimate]:

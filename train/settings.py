@@ -1,7 +1,7 @@
 """Settings of training. This module imports neither torch nor NumPy; see `renderer.settings`."""
 
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -370,10 +370,7 @@ class ExperimentSettings(NetworkSettings):
                 raise InputError(f"photos has the name {name!r} for a folder: {advice}", "photos")
         renders_meshes = self.augment.renders and self.augment.mode != "folder"
         if renders_meshes:
-            self.scene = self.scene.with_lights(self.augment.attack.parameters)
-        # The gradient of an attack on the pose needs the silhouettes of objects.
-        if renders_meshes and "pose" in self.augment.attack.parameters:
-            self.renderer = replace(self.renderer, silhouettes=True)
+            prepare_attack(self, self.augment.attack.parameters)
         if self.label is None:
             # The classes of the meshes will become the label when the classes of the network
             # are known. `with_class_names` then creates these settings again.
@@ -450,6 +447,14 @@ class ExperimentSettings(NetworkSettings):
         if missing and len(labels) > 1:
             raise self.wrong("label", f"has no mesh of {min(missing)}: add one to meshes")
         return objects
+
+
+def prepare_attack(settings: Any, attacked: Collection[str]) -> None:
+    """Add to the scene and the renderer in some settings what attacked parameters need."""
+    settings.scene = settings.scene.with_lights(attacked)
+    # The gradient of an attack on the pose needs the silhouettes of objects.
+    if "pose" in attacked:
+        settings.renderer = replace(settings.renderer, silhouettes=True)
 
 
 def read_objects(items: Sequence[Any], label: str, key: str) -> dict[str, ObjectSettings]:

@@ -13,7 +13,7 @@ from train.cli import Command, read_settings
 from train.data.photo import Photograph
 from train.networks import WideResNet, describe
 from train.results.compare import Evaluation
-from train.results.metrics import Pooled
+from train.results.metrics import Pool
 from train.results.predictions import Predictions
 from train.results.scoring import rank_classes
 from train.results.store import RunSummary
@@ -72,7 +72,7 @@ def ranked(
 
 def evaluation_of(predictions: Predictions) -> Evaluation:
     """Evaluate predictions of a run that has no folder."""
-    return Evaluation(RunSummary(Path("run"), "network", {}, {}, None), Pooled(predictions))
+    return Evaluation(RunSummary(Path("run"), "network", {}, {}, None), Pool(predictions))
 
 
 def attack_shortly(patch: pytest.MonkeyPatch, *kinds: str, steps=2, additional=2) -> None:

@@ -322,8 +322,7 @@ def transfer_success(
     """
     counts = {}
     for kind in progress(KINDS, "transfer"):
-        result = adversaries(attacked, views, kind, additional=True)
-        (row,) = transfer(result, [other])
+        (row,) = transfer(adversaries(attacked, views, kind, additional=True), [other])
         # Without a success, there is no lighting to test, and all masks are empty.
         is_tested = np.array(row["clean_correct"], bool)
         masks = (row["success"], is_tested, row["success_without_noise"])
@@ -501,9 +500,7 @@ def _match(pairs: Sequence[tuple[Found, Marked]], iou: float) -> Matches:
 def _curve(matches: Matches) -> list[tuple[float, ...]]:
     """Return false detections per image and recall at descending thresholds."""
     every = np.ones((1, matches.image_count))
-    # Objects that are never detected have the score -inf, which is no threshold.
-    scores = matches.objects.score
-    thresholds = np.unique([*scores[np.isfinite(scores)], *matches.detections.score])[::-1]
+    thresholds = np.unique(matches.detections.score)[::-1]
     measures = (matches.false_per_image, matches.recall)
     # CURVE_POINTS thresholds are enough for the plot.
     return [

@@ -405,7 +405,7 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
     a metric is unknown.
     """
     original, *remedies = evaluations
-    positives = evaluations[original][0].pooled.all.positives
+    positives = evaluations[original][0].pooled.positives
     metric = "class_top1" if len(positives.labels) > 1 else EQUAL_RATE
 
     def gain_over(name: str, reference: str) -> Difference | None:

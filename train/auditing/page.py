@@ -188,7 +188,7 @@ def _first_screen(networks: Networks, folders: Mapping[str, Path]) -> first_scre
             screen = first_screen.compare_networks(before, after, names, folder, folder.name)
             if screen is not None:
                 return screen
-        metrics = [item.pooled.all.metrics for item in evaluations]
+        metrics = [item.pooled.metrics for item in evaluations]
         place = first_screen.describe_place(folder, folder.name)
     # Both are shown under the kind of lighting that fools the first network most.
     kind = networks[0].strongest_kind

@@ -473,8 +473,7 @@ def complete(settings: AuditSettings, classes: Sequence[str]) -> AuditSettings:
         negatives = [f"solid:{name}" for name in names]
     meshes = class_names.with_class_name(settings.meshes, classes, "meshes")
     negatives = class_names.with_class_name(negatives, classes, "hard_negatives")
-    others = read_objects(negatives, "", "hard_negatives")
-    class_names.require_others(others, [label], classes)
+    class_names.require_others(read_objects(negatives, "", "hard_negatives"), [label], classes)
     return replace(settings, label=label, meshes=meshes, hard_negatives=negatives)
 
 

@@ -126,9 +126,9 @@ def _train_in(folder: Path, settings: ExperimentSettings, command: str, out: Pat
             first_process.enter_context(logged_to(writable_folder(folder, "out") / LOG))
             first_process.enter_context(sole_writer(*settings_of_runs))
         try:
-            data, initial = load_inputs(next(iter(settings_of_runs.values())))
+            inputs = load_inputs(next(iter(settings_of_runs.values())))
             # All mistakes are reported before the first run is trained.
-            runs = [Run(of, data, path, initial, command) for path, of in settings_of_runs.items()]
+            runs = [Run(of, *inputs, path, command) for path, of in settings_of_runs.items()]
             # The main run is the last one. It begins first, because it also removes the earlier
             # runs in the subfolders of its folder, to which the baselines write.
             for run in reversed(runs):
@@ -230,8 +230,7 @@ def sweep(
     # Numbers are checked now. The files and networks that texts name are checked by loading them.
     # The nodes of a cluster have other devices, so their runs are not loaded here.
     for folder, settings in () if "launcher=slurm" in runs[0] else new_runs.values():
-        data, initial = load_inputs(settings)
-        Run(settings, data, folder, initial)
+        Run(settings, *load_inputs(settings), folder)
     # The names of the folders leave out settings that are the same in all runs.
     excluded = ",".join(map(quoted, shared_keys))
     sys.argv.append(f"hydra.job.config.override_dirname.exclude_keys=[{excluded}]")
@@ -273,8 +272,7 @@ def _run(config: DictConfig, folder: Path) -> None:
         try:
             settings = with_label(read_settings(ExperimentSettings, config))
             settings.train.resume = checkpoints.exists(folder)
-            data, initial = load_inputs(settings)
-            run = Run(settings, data, folder, initial, format_command(job.overrides.task))
+            run = Run(settings, *load_inputs(settings), folder, format_command(job.overrides.task))
             run.begin()
             run.train()
         except Exception as error:

@@ -200,7 +200,7 @@ def harden(
             at_end.callback(torch.set_num_threads, torch.get_num_threads())
             at_end.callback(setattr, cudnn, "benchmark", cudnn.benchmark)
             initial = initial_of(classifier, settings.size)
-            run = Run(settings, load_data(settings, initial), folder, initial)
+            run = Run(settings, load_data(settings, initial), initial, folder)
             run.begin()
             run.train(logger)
             if out is not None:

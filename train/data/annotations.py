@@ -139,8 +139,7 @@ def read_masks(folder: Path) -> tuple[list[Annotated], dict[str, Path], list[str
     if not paths:
         first = Path(missing[0]).with_suffix(".png")
         raise InputError(f"{masks} has no mask {first}: add it", "photos")
-    marked = [_annotated(images / name, name, None, []) for name in paths]
-    return marked, paths, missing
+    return [_annotated(images / name, name, None, []) for name in paths], paths, missing
 
 
 def _annotated(

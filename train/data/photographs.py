@@ -284,17 +284,17 @@ def load_photographs(
         pool.shutdown(cancel_futures=True)
     readable = [index for index, error in enumerate(errors) if error is None]
     unreadable = [index for index, error in enumerate(errors) if error]
-    if not unreadable:
-        return list(photographs), images, []
-    if not (readable and skip_unreadable):
+    if unreadable and not (readable and skip_unreadable):
         first = unreadable[0]
         fault = f"{len(unreadable)} of {count} photographs cannot be read"
         can_skip = readable and skip_unreadable is not None
         advice = ", or set skip_unreadable=True to skip them" if can_skip else ""
         example = f"the first being {paths[first]} ({errors[first]})"
         raise InputError(f"{fault}, {example}: replace them{advice}")
-    unreadable_paths = [str(photographs[index].path) for index in unreadable]
-    return [photographs[index] for index in readable], images[readable], unreadable_paths
+    # Images that are all readable are not copied.
+    shown = images[readable] if unreadable else images
+    missing = [str(photographs[index].path) for index in unreadable]
+    return [photographs[index] for index in readable], shown, missing
 
 
 def _read_image(image: UInt8[Tensor, "3 height width"], path: Path) -> Exception | None:

@@ -400,8 +400,7 @@ def write_laboratory(settings: LabSettings) -> int:
         write_csv(out / TABLE, [COLUMNS, *sorted(rows)], line_end="\r\n")
         versions = {"python": platform.python_version()}
         versions |= {name: version(name) for name in PACKAGES}
-        description = {**asdict(settings), "versions": versions}
-        write_json(out / DESCRIPTION, description, indent=2)
+        write_json(out / DESCRIPTION, {**asdict(settings), "versions": versions}, indent=2)
         return len(rows)
 
 
@@ -501,8 +500,10 @@ def kept_aside_settings(
     labels = label_names(settings.label)
     meshes: list[Any] = []
     for label in labels:
-        if can_be_generated(label):
-            meshes += _generated(_solid_name(label), label, POSITIVE_COUNT)
+        # The name of the solid of a class, such as "golf_ball".
+        name = simplified(label).replace(" ", "_")
+        if name in {*SOLIDS, *HARD_NEGATIVES}:
+            meshes += _generated(name, label, POSITIVE_COUNT)
         else:
             # Meshes of the user are the objects of the training, in other lighting.
             meshes += [asdict(item) for item in settings.objects.values() if item.label == label]
@@ -517,16 +518,6 @@ def kept_aside_settings(
     setups = settings.evaluate.laboratory_setups
     rendered = str(out), settings.label, meshes, setups, [*OTHER_PATTERNS]
     return LabSettings(*rendered, size=size, seed=FIRST_SEED, overwrite=True)
-
-
-def can_be_generated(label: str) -> bool:
-    """Return whether a class has generated solids."""
-    return _solid_name(label) in {*SOLIDS, *HARD_NEGATIVES}
-
-
-def _solid_name(label: str) -> str:
-    """Return the name that the solid of a class would have, such as "golf_ball"."""
-    return simplified(label).replace(" ", "_")
 
 
 def _generated(name: str, label: str, count: int) -> list[Any]:

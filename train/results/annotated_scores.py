@@ -120,19 +120,17 @@ class DetectionScores(AnnotatedScores):
         """Make a table with a row for all classes, and one for each class in each folder."""
         groups = {"": {ALL: self.overall, **self.by_label}, **self.by_source}
         cells: list[list[object]] = []
-        shown: list[tables.Estimate] = []
         for source, of_group in groups.items():
             for name, metrics in of_group.items():
                 # With a single class, its row would repeat that of all classes.
                 if name != ALL or len(self.labels) > 1:
                     estimates = (metrics.recall, metrics.ap50, metrics.false_per_image)
-                    shown += estimates
                     title = f"{source}: {name}" if source else name
-                    cells.append([title, metrics.n, *map(tables.format_interval, estimates)])
+                    cells.append([title, metrics.n, *estimates])
         threshold, iou = self.task.threshold, self.task.iou
         recall, false_count = f"recall at {threshold:g}", f"false per image at {threshold:g}"
-        title = f"IoU {iou:g}; {tables.describe_intervals(shown)}"
-        return Table(title, ["", "objects", recall, "AP50", false_count], cells)
+        header = ["", "objects", recall, "AP50", false_count]
+        return tables.table_of(f"IoU {iou:g}; ", header, cells)
 
     def to_summary(self) -> dict[str, Any]:
         """Convert the scores to the content of summary.json."""
@@ -164,9 +162,9 @@ class SegmentationScores(AnnotatedScores):
 
     def table(self) -> Table:
         """Make a table of the mean IoU and that of each class."""
-        rows = [["mean", tables.format_interval(self.miou)]]
-        rows += [[name, f"{iou:.3f}"] for name, iou in self.by_class.items()]
-        return Table(tables.describe_intervals([self.miou]), ["class", "IoU"], rows)
+        of_classes = [(name, f"{iou:.3f}") for name, iou in self.by_class.items()]
+        rows = [("mean", self.miou), *of_classes]
+        return tables.table_of("", ["class", "IoU"], rows)
 
     def to_summary(self) -> dict[str, Any]:
         """Convert the scores to the content of summary.json."""

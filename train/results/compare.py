@@ -8,15 +8,16 @@ interval.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from statistics import fmean, stdev
 from typing import NamedTuple
 
-from train.results import store
+from train.results import store, tables
 from train.results.intervals import Jackknife, change
-from train.results.metrics import COUNTED_EACH, METRICS, TITLES, TOP_RANKS, Pool, Pooled
+from train.results.metrics import COUNTED_EACH, METRICS, TITLES, TOP_RANKS, Pool
 from train.results.predictions import PREDICTIONS
 from train.results.store import INITIAL, Methods, RunSummary, Scored, ScoredRun
-from train.results.tables import RANGE, Estimate, Table, describe_intervals, format_interval
+from train.results.tables import Estimate, Table, format_interval, table_of
 from train.settings import PHOTOGRAPHS, UNLABELED
 
 # Titles of the columns of tables that have a column for each metric in `METRICS`.
@@ -52,7 +53,7 @@ class Evaluation(NamedTuple):
     """Predictions of the network of a run for one folder of photographs, in groups."""
 
     run: RunSummary
-    pooled: Pooled
+    pooled: Pool
 
     def rows(self, *properties: str) -> list[Subset]:
         """List the rows of a table: all images, several positive classes, and subsets."""
@@ -90,7 +91,7 @@ def group_by_images(methods: Methods) -> dict[str, Scored]:
             title += f": {auc.positives:,} images of {' or '.join(labels)}, "
             title += f"{auc.negatives:,} images of other objects"
             title += COUNTED_EACH if len(labels) > 1 else ""
-            title += f"; {describe_intervals([auc])}" if auc.low is not None else ""
+            title += f"; {tables.describe_intervals([auc])}" if auc.low is not None else ""
         # Two groups can have the same folder name and the same numbers.
         if title in titled:
             title = f"{title} ({len(titled) + 1})"
@@ -127,7 +128,7 @@ def _mean(estimates: Iterable[Estimate | None]) -> Estimate | None:
     if len(known) < 2:
         return known[0] if known else None
     values = [item.value for item in known if item.value is not None]
-    over = f"{RANGE} of {len(values)} seeds"
+    over = f"{tables.RANGE} of {len(values)} seeds"
     return Estimate(fmean(values), min(values), max(values), over)
 
 
@@ -136,14 +137,12 @@ def group_table(methods: Evaluations, by: str) -> Table:
     every_evaluation = [item for evaluations in methods.values() for item in evaluations]
     # A dictionary has each subset once, in order.
     subsets = dict.fromkeys(subset for item in every_evaluation for subset in item.rows(by))
-    rows: list[list[str]] = []  # Cells of the table.
-    shown: list[Estimate | None] = []  # Metrics in all cells, whose intervals the title explains.
-    for subset in subsets:
-        for method, evaluations in methods.items():
-            metrics = [mean_metric(evaluations, subset, name) for name in METRICS]
-            shown += metrics
-            rows.append([subset.title, method, *map(format_interval, metrics)])
-    return Table(f"by {by}, {describe_intervals(shown)}", [by, "network", *HEADER], rows)
+    rows = [
+        [subset.title, method, *(mean_metric(items, subset, name) for name in METRICS)]
+        for subset in subsets
+        for method, items in methods.items()
+    ]
+    return table_of(f"by {by}, ", [by, "network", *HEADER], rows)
 
 
 def choose_pairs(methods: Evaluations) -> list[tuple[str, str]]:
@@ -227,7 +226,6 @@ def difference_table(methods: Evaluations, *properties: str) -> Table:
     The rows are all images, those of each positive class, and subsets by other properties.
     """
     rows = []
-    shown: list[Difference | None] = []
     for method, base in choose_pairs(methods):
         evaluations, reference = methods[method], methods[base]
         # Runs with the same seeds are compared in pairs.
@@ -235,11 +233,10 @@ def difference_table(methods: Evaluations, *properties: str) -> Table:
         counts = f"{len(evaluations)} and {len(reference)} seeds{paired}"
         for subset in reference[0].rows(*properties):
             differences = [difference(evaluations, reference, subset, name) for name in METRICS]
-            shown += differences
-            cells = [format_interval(item, sign="+") for item in differences]
-            rows.append([f"{method} minus {base} ({counts})", subset.title, *cells])
-    title = f"differences on the same images, {describe_intervals(shown)}"
-    return Table(title, ["networks", "images", *HEADER], rows)
+            rows.append([f"{method} minus {base} ({counts})", subset.title, *differences])
+    with_sign = partial(format_interval, sign="+")
+    header = ["networks", "images", *HEADER]
+    return table_of("differences on the same images, ", header, rows, with_sign)
 
 
 def run_tables(methods: Methods) -> list[Table]:
@@ -254,7 +251,7 @@ def run_tables(methods: Methods) -> list[Table]:
     # A dictionary has each name once, in the order of the runs.
     names = dict.fromkeys(run.config.get("test_images", "") for run in every_run)
     title = " or ".join(f"accuracy on {name}" for name in names if name)
-    tables = [_run_table(title, [title_of_accuracies], lines)]
+    accuracies = _run_table(title, [title_of_accuracies], lines)
     # The first run of each method. Networks without a run have no settings of a training.
     heads = {method: runs[0] for method, runs in methods.items() if runs[0].seed is not None}
     # Titles of the settings in which the runs differ, by their keys.
@@ -263,7 +260,7 @@ def run_tables(methods: Methods) -> list[Table]:
     for method, head in heads.items() if varied else ():
         rows.append([method, *(str(head.settings.get(key)) for key in varied)])
     header = ["network", *varied.values()]
-    return [*tables, Table("settings in which the methods differ", header, rows)]
+    return [accuracies, Table("settings in which the methods differ", header, rows)]
 
 
 def _accuracies(methods: Methods) -> tuple[str, Methods]:
@@ -328,13 +325,13 @@ def _run_table(title: str, header: Sequence[str], lines: Mapping[str, Sequence[L
 def format_comparison(runs: Sequence[RunSummary], by: str = "source") -> str:
     """Compare runs in the tables that pnb-train and pnb-compare print with --verbose."""
     methods = store.group_by_method(runs)
-    tables = run_tables(methods)
+    shown = run_tables(methods)
     for title, group in group_by_images(methods).items():
-        tables.append(score_table(title, group))
+        shown.append(score_table(title, group))
         evaluations = read_evaluations(group)
         for table in (group_table(evaluations, by), difference_table(evaluations, by)):
-            tables.append(replace(table, title=f"{title.partition(':')[0]}: {table.title}"))
-    return "\n\n".join(str(table.without_unknown_columns) for table in tables if table.rows)
+            shown.append(replace(table, title=f"{title.partition(':')[0]}: {table.title}"))
+    return "\n\n".join(str(table.without_unknown_columns) for table in shown if table.rows)
 
 
 def format_short_comparison(runs: Sequence[RunSummary], by: str = "source") -> str:

@@ -114,12 +114,11 @@ class Matches:
         found = self.detections
         return found.image[(found.score >= threshold) & ~found.is_right]
 
-    def average_precision(self, counts: Counts) -> Float[np.ndarray, " k"]:
-        """Compute the average precision of one class, as COCO does. That of no object is NaN."""
-        return np.array([self._average_precision(row) for row in counts])
+    def average_precision(self, counts: Float[np.ndarray, " n"]) -> float:
+        """Compute the average precision of one class, as COCO does. That of no object is NaN.
 
-    def _average_precision(self, counts: Float[np.ndarray, " n"]) -> float:
-        """Compute the average precision of one class if image i counts `counts[i]` times."""
+        Image i counts `counts[i]` times.
+        """
         object_count = counts[self.objects.image].sum()
         if not object_count:
             return np.nan
@@ -203,7 +202,7 @@ def score(
     shown = [item for item in by_label if len(item.objects)]
 
     def mean_precision(counts: np.ndarray) -> np.ndarray:
-        values = np.stack([item.average_precision(counts) for item in shown])
+        values = np.array([[item.average_precision(row) for row in counts] for item in shown])
         is_known = np.isfinite(values)
         with np.errstate(invalid="ignore"):
             return np.where(is_known, values, 0).sum(0) / is_known.sum(0)

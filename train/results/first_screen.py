@@ -150,7 +150,7 @@ def compare_networks(
         subjects = f"the network “{names[0]}”", f"the network “{names[1]}”"
         change = f"“{names[1]}”"
     # All seeds have the same images, so the first one gives their numbers and labels.
-    pool = after[0].pooled.all
+    pool = after[0].pooled
     labels = pool.predictions.labels
     label = tables.join_words([in_words(item) for item in labels], "or")
     each, rate = "", "false_positive_rate"

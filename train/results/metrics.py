@@ -1,8 +1,8 @@
 """Metrics of an evaluation: recall, false-positive rate, AUC and top-1.
 
-A `Pool` has predictions that are scored together, and computes their `Metrics`. `Pooled` has all
-pools of one evaluation: of all images, and of each label, source, mesh and class. A label is the
-name of a positive class. An image is a positive if it shows this class, and otherwise a negative.
+A `Pool` has predictions that are scored together, and computes their `Metrics`. That of a whole
+evaluation has the pools of each label, source, mesh and class. A label is the name of a positive
+class. An image is a positive if it shows this class, and otherwise a negative.
 """
 
 from collections import Counter
@@ -292,64 +292,18 @@ class Pool(ShortRepr):
         outcomes = {name: item.jackknife for name, item in self.outcomes.items() if len(item.hits)}
         return {**outcomes, **self._rankings}
 
-
-def choose_units(*groups: Predictions) -> Units:
-    """Choose objects as units if each group shows enough of them, and otherwise images.
-
-    Images show the same object if they have the same label and mesh. If the mesh of an image is
-    unknown, images are the units.
-    """
-    shown = [group.photograph for group in groups]
-    is_named = [bool(item.mesh) for items in shown for item in items]
-    has_enough = all(is_named) and all(len(_objects(group)) >= MIN_OBJECTS for group in groups)
-    objects = [[(item.label, item.mesh) for item in items] for items in shown]
-    images = [[item.path for item in items] for items in shown]
-    units, over = (objects, OBJECTS) if has_enough else (images, THESE_OBJECTS)
-    return Units([_number(names) for names in units], over if any(is_named) else IMAGES)
-
-
-def _objects(predictions: Predictions) -> set[object]:
-    """Name the objects that photographs show. Without any name, each photograph is an object."""
-    items = predictions.photograph
-    return {(item.label, item.mesh) for item in items if item.mesh} or {item.path for item in items}
-
-
-def _number(names: Iterable[object]) -> np.ndarray:
-    """Number names from 0 in order of first appearance, shape (n,)."""
-    number_of_name: dict[object, int] = {}
-    return np.array([number_of_name.setdefault(name, len(number_of_name)) for name in names])
-
-
-@dataclass(frozen=True, repr=False)
-class Pooled(ShortRepr):
-    """Predictions of one evaluation, grouped by label, source, mesh and class.
-
-    Attributes:
-        predictions: Predictions for one or several labels.
-        thresholds: Threshold on the log-odds of each label. If it is empty, the
-            metrics in `AT_THRESHOLD` are None.
-    """
-
-    predictions: Predictions
-    thresholds: Thresholds = field(default_factory=dict)
-
-    @cached_property
-    def all(self) -> Pool:
-        """All predictions, which are scored together."""
-        return Pool(self.predictions, self.thresholds)
-
-    def groups(self, by: str) -> dict[str, Pool]:
+    def groups(self, by: str) -> dict[str, "Pool"]:
         """Groups by a property: "label", "source", "mesh" or "class". "all" is one group, ""."""
-        return {"": self.all} if by == "all" else getattr(self, f"by_{by}")
+        return {"": self} if by == "all" else getattr(self, f"by_{by}")
 
     @cached_property
-    def by_label(self) -> dict[str, Pool]:
+    def by_label(self) -> dict[str, "Pool"]:
         """For each label, its predictions, which are scored together."""
         groups = group_rows(self.predictions, self.predictions.label)
         return {label: Pool(group, self.thresholds) for label, group in groups.items()}
 
     @cached_property
-    def by_source(self) -> dict[str, Pool]:
+    def by_source(self) -> dict[str, "Pool"]:
         """For each source, the predictions for its images, which are scored together.
 
         The ROC curve compares the positives of a source with its negatives. A
@@ -376,7 +330,7 @@ class Pooled(ShortRepr):
         return pools
 
     @cached_property
-    def by_mesh(self) -> dict[str, Pool]:
+    def by_mesh(self) -> dict[str, "Pool"]:
         """For each known mesh, the predictions for its images, which are scored together.
 
         If photographs of several labels name the same mesh, these are different objects, and the
@@ -391,11 +345,11 @@ class Pooled(ShortRepr):
         return self._by_content(names)
 
     @cached_property
-    def by_class(self) -> dict[str, Pool]:
+    def by_class(self) -> dict[str, "Pool"]:
         """For each class, the predictions for its images, which are scored together."""
         return self._by_content(self.predictions.shown)
 
-    def _by_content(self, names: Iterable[Any]) -> dict[str, Pool]:
+    def _by_content(self, names: Iterable[Any]) -> dict[str, "Pool"]:
         """Collect the predictions for the images of each mesh, or of each class.
 
         The ROC curve of a positive mesh compares its images with all negatives, and that of another
@@ -409,11 +363,38 @@ class Pooled(ShortRepr):
             # compared with themselves.
             negatives = group[~np.isin(group.shown, self.predictions.labels)]
             for_roc = (
-                positives if len(positives) else self.all.positives,
-                negatives if len(negatives) else self.all.negatives,
+                positives if len(positives) else self.positives,
+                negatives if len(negatives) else self.negatives,
             )
             pools[name] = Pool(group, self.thresholds, for_roc)
         return pools
+
+
+def choose_units(*groups: Predictions) -> Units:
+    """Choose objects as units if each group shows enough of them, and otherwise images.
+
+    Images show the same object if they have the same label and mesh. If the mesh of an image is
+    unknown, images are the units.
+    """
+    shown = [group.photograph for group in groups]
+    is_named = [bool(item.mesh) for items in shown for item in items]
+    has_enough = all(is_named) and all(len(_objects(group)) >= MIN_OBJECTS for group in groups)
+    objects = [[(item.label, item.mesh) for item in items] for items in shown]
+    images = [[item.path for item in items] for items in shown]
+    units, over = (objects, OBJECTS) if has_enough else (images, THESE_OBJECTS)
+    return Units([_number(names) for names in units], over if any(is_named) else IMAGES)
+
+
+def _objects(predictions: Predictions) -> set[object]:
+    """Name the objects that photographs show. Without any name, each photograph is an object."""
+    items = predictions.photograph
+    return {(item.label, item.mesh) for item in items if item.mesh} or {item.path for item in items}
+
+
+def _number(names: Iterable[object]) -> np.ndarray:
+    """Number names from 0 in order of first appearance, shape (n,)."""
+    number_of_name: dict[object, int] = {}
+    return np.array([number_of_name.setdefault(name, len(number_of_name)) for name in names])
 
 
 def group_rows(predictions: Predictions, names: Iterable[Any]) -> dict[str, Predictions]:

@@ -302,14 +302,13 @@ def _tile(row: Any, image: UInt8[np.ndarray, "3 H W"], color: str) -> Tile:
     return Tile(np.asarray(ImageOps.expand(enlarged, FRAME_WIDTH, color)), captions)
 
 
-def write_roc(folder: Path, overall: Pair, by_name: Mapping[str, Pair], label: str) -> None:
+def write_roc(folder: Path, pairs: Mapping[str, Pair], label: str) -> None:
     """Write ROC curves to the table roc.csv and to the figure roc.png.
 
-    There is a curve for all images, and one for each source or label. A curve
+    There is a curve for all images, whose name is "", and one for each source or label. A curve
     is left out if it lacks positives or negatives. A pair has the log-odds of positives and of
     negatives.
     """
-    pairs = {"": overall, **by_name}
     known = {name: pair for name, pair in pairs.items() if all(map(len, pair))}
     # A source or a label can have the name "all", too.
     title = "all images" if "all" in known else "all"

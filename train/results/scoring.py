@@ -31,7 +31,7 @@ from train.data import photographs as folders
 from train.data.photo import TABLE, Photograph
 from train.results import metrics, predictions, tables
 from train.results.intervals import thresholds
-from train.results.metrics import TITLES, Metrics, Outcome, Pooled
+from train.results.metrics import TITLES, Metrics, Outcome, Pool
 from train.results.pictures import contact_sheet, write_roc
 from train.results.predictions import Predictions
 from train.results.tables import Estimate, Proportion, Table
@@ -202,7 +202,7 @@ class Scores(ShortRepr):
     """
 
     predicted: FolderPredictions
-    pooled: Pooled
+    pooled: Pool
     points: Sequence[OperatingPoint]
     by: str
 
@@ -212,10 +212,9 @@ class Scores(ShortRepr):
         A Markdown table has a row for each metric of all images, with its 95% interval. The metrics
         in `DETAILS` are left out.
         """
-        rows = []
-        for name in (*_fraction_metrics(self), *RANKING_METRICS):
-            if name not in DETAILS:
-                rows.append((TITLES[name], _format_metric(self.overall.find(name))))
+        names = [*_fraction_metrics(self), *RANKING_METRICS]
+        shown_names = [name for name in names if name not in DETAILS]
+        rows = [(TITLES[name], _format_metric(self.overall.find(name))) for name in shown_names]
         shown = (self.overall.recall, self.overall.false_positive_rate, self.overall.auc)
         title = f"{_count_images(self)}; {tables.describe_intervals(shown)}"
         return "\n".join([str(Table(title, ["metric", self.label], rows)), *_notes(self)])
@@ -228,17 +227,12 @@ class Scores(ShortRepr):
     @property
     def overall(self) -> Metrics:
         """Metrics of all photographs. With several labels, one counts once for each label."""
-        return self.pooled.all.metrics
+        return self.pooled.metrics
 
     @cached_property
     def by_label(self) -> dict[str, Metrics]:
         """Metrics of each label. Empty with a single label."""
         return self._metrics_by("label") if len(self.predicted.labels) > 1 else {}
-
-    @cached_property
-    def by_source(self) -> dict[str, Metrics]:
-        """Metrics of the photographs of each source."""
-        return self._metrics_by("source")
 
     @cached_property
     def groups(self) -> dict[str, Metrics]:
@@ -279,7 +273,7 @@ class Scores(ShortRepr):
         predicted = self.predicted
         # `by_label` is empty if there is a single label. The file then has no lists for it.
         has_labels = bool(self.by_label)
-        groups = {"by_label": self.by_label, "by_source": self.by_source}
+        groups = {"by_label": self.by_label, "by_source": self._metrics_by("source")}
         groups[SUMMARY_KEYS[self.by]] = self.groups
         summary: dict[str, Any] = {
             "label": predicted.labels if has_labels else predicted.labels[0],
@@ -288,8 +282,8 @@ class Scores(ShortRepr):
             **self.overall.to_summary(),
             "n": {
                 "photographs": len(predicted.images),
-                "positives": len(self.pooled.all.positives),
-                "negatives": len(self.pooled.all.negatives),
+                "positives": len(self.pooled.positives),
+                "negatives": len(self.pooled.negatives),
                 "unreadable": len(predicted.unreadable),
                 "left_out": len(predicted.left_out),
             },
@@ -326,7 +320,7 @@ def score(
     if by == "mesh" and not any(item.mesh for item in predicted.predictions.photograph):
         fault = f"by=mesh, but {predicted.folder} has no {TABLE} with a column mesh"
         raise InputError(f"{fault}: add this table, or remove by=mesh")
-    pooled = Pooled(predicted.predictions, {point.label: point.threshold for point in points})
+    pooled = Pool(predicted.predictions, {point.label: point.threshold for point in points})
     return Scores(predicted, pooled, points, by)
 
 
@@ -345,9 +339,9 @@ def write(scores: Scores, out: Path) -> None:
     sheet = contact_sheet(predicted.predictions, predicted.images.numpy())
     write_image(out / predictions.CONTACT_SHEET, sheet)
     groups = scores.pooled.groups("label" if len(predicted.labels) > 1 else "source")
-    # The log-odds of positives and negatives of each group.
-    curves = {name: pool.scores for name, pool in groups.items()}
-    write_roc(out, scores.pooled.all.scores, curves, scores.label)
+    # The log-odds of positives and negatives of all photographs, and of each group.
+    pools = {"": scores.pooled, **groups}
+    write_roc(out, {name: pool.scores for name, pool in pools.items()}, scores.label)
     predictions.write_summary(out, scores.to_summary())
 
 
@@ -386,23 +380,18 @@ def choose_operating_points(
 def format_scores(scores: Scores) -> str:
     """Format scores as Markdown tables, with a row for each label and each source or mesh."""
     names = [*_fraction_metrics(scores), *RANKING_METRICS]
-    rows = []
-    # All estimates of the table. Its title says over what their intervals are.
-    shown: list[Estimate | None] = []
     groups = [("all", scores.overall), *scores.by_label.items(), *scores.groups.items()]
-    for title, of_group in groups:
-        estimates = [of_group.find(name) for name in names]
-        shown += estimates
-        rows.append([title, *map(_format_metric, estimates)])
-    table = Table(tables.describe_intervals(shown), ["", *(TITLES[name] for name in names)], rows)
+    rows = [[title, *map(of_group.find, names)] for title, of_group in groups]
+    header = ["", *(TITLES[name] for name in names)]
+    table = tables.table_of("", header, rows, _format_metric)
     parts = [_count_images(scores), table, _class_table(scores), *_notes(scores)]
     return "\n\n".join(map(str, parts))
 
 
 def _count_images(scores: Scores) -> str:
     """Say how many positive and negative images were scored."""
-    positives = len(scores.pooled.all.positives)
-    negatives = len(scores.pooled.all.negatives)
+    positives = len(scores.pooled.positives)
+    negatives = len(scores.pooled.negatives)
     each = metrics.COUNTED_EACH if scores.by_label else ""
     return f"{positives} images of {scores.label}, {negatives} negatives{each}"
 

@@ -15,7 +15,7 @@ from augment.attack_settings import LINES
 from augment.augmentation_settings import MODES
 from renderer.errors import InputError, explained
 from train import console, run_config, run_folder
-from train.results.metrics import Metrics, Pooled, Thresholds, describe_point
+from train.results.metrics import Metrics, Pool, Thresholds, describe_point
 from train.results.predictions import PREDICTIONS, SUMMARY, read_predictions
 from train.run_config import CONFIG, read_config
 from train.run_folder import BEFORE, PUBLISHED, read_json, read_metrics
@@ -133,7 +133,7 @@ class ScoredRun(NamedTuple):
         """Path of this sub-folder."""
         return self.run.folder / self.name
 
-    def pooled(self) -> Pooled:
+    def pooled(self) -> Pool:
         """Read the predictions."""
         path = self.folder / PREDICTIONS
         labels, thresholds = tuple(self.scores.labels), tuple(self.scores.thresholds.items())
@@ -143,9 +143,9 @@ class ScoredRun(NamedTuple):
 @lru_cache(maxsize=64)
 def _pool(
     path: Path, modified: int, labels: tuple[str, ...], thresholds: tuple[tuple[str, float], ...]
-) -> Pooled:
+) -> Pool:
     """Read predictions.csv once at a time of modification, for all tables and pages."""
-    return Pooled(read_predictions(path, labels), dict(thresholds))
+    return Pool(read_predictions(path, labels), dict(thresholds))
 
 
 # The runs of each method with their scores on the same images.

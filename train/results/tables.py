@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
 from statistics import NormalDist
+from typing import Any
 
 import numpy as np
 
@@ -164,6 +165,19 @@ def format_interval(estimate: Estimate | None, sign: str = "", form: str = ".3f"
     if estimate.low is None or estimate.high is None:
         return value
     return f"{value} [{estimate.low:{sign}{form}}, {estimate.high:{sign}{form}}]"
+
+
+def table_of(
+    title: str, header: Sequence[str], rows: Sequence[Sequence[Any]], form: Any = format_interval
+) -> Table:
+    """Make a table with metrics in cells, which the function `form` formats.
+
+    The title ends with what their intervals are over.
+    """
+    shown = [cell for row in rows for cell in row if isinstance(cell, Estimate)]
+    # A metric that is unknown is None.
+    texts = [[cell if isinstance(cell, str | int) else form(cell) for cell in row] for row in rows]
+    return Table(title + describe_intervals(shown), header, texts)
 
 
 def describe_intervals(estimates: Iterable[Estimate | None]) -> str:

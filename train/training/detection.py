@@ -213,12 +213,11 @@ def validate(
     Return it as "accuracy", and its complement as "loss".
     """
     device = split.labels.device
-    own = slice(distributed.rank(), None, distributed.world_size())
-    own_rows = torch.arange(len(split), device=device)[own]
+    rows = torch.arange(len(split), device=device)[distributed.rank() :: distributed.world_size()]
     # Boxes of the teacher that the network finds, too, and all boxes of the teacher.
     counts = torch.zeros(2, device=device)
     # With few photographs, a process has none, and not every network takes an empty batch.
-    for images in split.squares(own_rows.split(BATCH) if len(own_rows) else ()):
+    for images in split.squares(rows.split(BATCH) if len(rows) else ()):
         pair = (detected(one, images.to(device), task) for one in (teacher, network))
         for expected, found in zip(*pair, strict=True):
             boxes, labels = (found[key].cpu().numpy() for key in ("boxes", "labels"))

@@ -80,92 +80,6 @@ class EpochState:
 
 
 @dataclass(eq=False)
-class TrainingStep:
-    """Loss, augmentation and optimizer of a network, with which it takes training steps.
-
-    Attributes:
-        teacher: Network before the training. None without distillation.
-    """
-
-    settings: TrainSettings
-    model: MixedPrecision
-    teacher: MixedPrecision | None
-    service: AugmentationService
-    size: int
-    labeled: bool
-
-    def __post_init__(self) -> None:
-        """Build the optimizer, the loss and the augmentation."""
-        settings, model, teacher, service = self.settings, self.model, self.teacher, self.service
-        device = device_of(model)
-        # `wrap_ddp` may replace layers of the network. The optimizer is built
-        # afterwards, so that it has the parameters of the new layers.
-        replica = wrap_ddp(model, None if isinstance(service.task, Detection) else self.size)
-        # The first optimizer of a process imports the compiler of torch, which takes seconds.
-        with progress_message("loading the optimizer"):
-            self.optimizer = recipe.build_optimizer(model, settings)
-        self.scaler = torch.amp.GradScaler(device.type, enabled=model.precision == "float16")
-        classes = service.positive_classes
-        self._augmentation = Augmentation(settings, model, teacher, service.seed, classes[1:])
-        with keyed(choice="compile"):
-            is_compiled = compiles(settings.compile, device)
-        self._loss: Callable[..., tuple[Tensor, Tensor]]
-        if isinstance(service.task, Detection):
-            self._loss = DetectionLoss(replica, settings, teacher, service.task).compute
-        else:
-            if settings.augmentation == "pgd" and not self.labeled:
-                fault = "augmentation=pgd attacks labels, which the photographs lack"
-                raise InputError(f"{fault}: choose another", "augmentation")
-            loss = recipe.TrainingLoss(replica, settings, classes, teacher, self.labeled)
-            sees_same = loss.learns_unchanged or not settings.consistency_weight
-            if teacher is not None and sees_same and not is_compiled:
-                # The teacher takes the features from the network in training, if they are equal.
-                loss.teacher = recipe.share_layers(settings, model, teacher, self.size)
-            self._loss = loss.compute
-            if is_compiled:
-                # torch limits the number of compiled functions in a process. Those of an
-                # earlier run are removed.
-                torch.compiler.reset()
-                self._loss = torch.compile(self._loss, mode="reduce-overhead", dynamic=False)
-
-    def take(self, batch: Batch, done: float, number: int) -> Float[Tensor, " 2"]:
-        """Change the weights by the gradient of the loss of a batch.
-
-        `done` is the fraction of the training that is done, and `number` the number of earlier
-        steps of the run. Return the sum of the losses of the images, and the number of correct
-        predictions.
-        """
-        settings = self.settings
-        for group in self.optimizer.param_groups:
-            group["lr"] = recipe.learning_rate(settings, done)
-        images, labels, rendered = batch
-        augmented = self._augmentation.apply(images, labels, number)
-        tensors = [augmented, labels, rendered]
-        if settings.consistency_weight:
-            # The consistency term compares the images before and after the augmentation.
-            tensors = [images, labels, rendered, augmented]
-        self.optimizer.zero_grad(set_to_none=True)
-        loss, hits = self._loss(*tensors)
-        self.scaler.scale(loss).backward()
-        # The gradient is scaled for float16, and its true norm is clipped.
-        if settings.clip_gradient:
-            self.scaler.unscale_(self.optimizer)
-            nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip_gradient)
-        self.scaler.step(self.optimizer)
-        self.scaler.update()
-        return torch.stack([loss.detach() * len(images), hits])
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the states of the optimizer and of the gradient scaler for a checkpoint."""
-        return {"optimizer": self.optimizer.state_dict(), "scaler": self.scaler.state_dict()}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Restore the optimizer and the gradient scaler from a checkpoint."""
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.scaler.load_state_dict(state["scaler"])
-
-
-@dataclass(eq=False)
 class Trainer:
     """Trainer of one network, which writes checkpoints to the folder of the run.
 
@@ -229,8 +143,42 @@ class Trainer:
         self.selected = self.averages.selected
         has_teacher = settings.distillation_weight or settings.consistency_weight
         teacher = self.initial if has_teacher else None
-        options = service, self.architecture["size"], self.labeled
-        self.step = TrainingStep(settings, model, teacher, *options)
+        # `wrap_ddp` may replace layers of the network. The optimizer is built
+        # afterwards, so that it has the parameters of the new layers.
+        replica = wrap_ddp(model, None if self.is_detector else self.architecture["size"])
+        # The first optimizer of a process imports the compiler of torch, which takes seconds.
+        with progress_message("loading the optimizer"):
+            self.optimizer = recipe.build_optimizer(model, settings)
+        self.scaler = torch.amp.GradScaler(self.device.type, enabled=model.precision == "float16")
+        absent = service.positive_classes[1:]
+        self._augmentation = Augmentation(settings, model, teacher, service.seed, absent)
+        self._loss = self._build_loss(replica, teacher)
+
+    def _build_loss(
+        self, replica: nn.Module, teacher: MixedPrecision | None
+    ) -> Callable[..., tuple[Tensor, Tensor]]:
+        """Build the function that computes the loss of a batch. None is no teacher."""
+        settings, service = self.settings, self.service
+        with keyed(choice="compile"):
+            is_compiled = compiles(settings.compile, self.device)
+        if isinstance(service.task, Detection):
+            return DetectionLoss(replica, settings, teacher, service.task).compute
+        if settings.augmentation == "pgd" and not self.labeled:
+            fault = "augmentation=pgd attacks labels, which the photographs lack"
+            raise InputError(f"{fault}: choose another", "augmentation")
+        classes = service.positive_classes
+        loss = recipe.TrainingLoss(replica, settings, classes, teacher, self.labeled)
+        sees_same = loss.learns_unchanged or not settings.consistency_weight
+        if teacher is not None and sees_same and not is_compiled:
+            # The teacher takes the features from the network in training, if they are equal.
+            size = self.architecture["size"]
+            loss.teacher = recipe.share_layers(settings, self.model, teacher, size)
+        if not is_compiled:
+            return loss.compute
+        # torch limits the number of compiled functions in a process. Those of an
+        # earlier run are removed.
+        torch.compiler.reset()
+        return torch.compile(loss.compute, mode="reduce-overhead", dynamic=False)
 
     def fit(self, train: Split, validation: Split, log: RunLog | None) -> None:
         """Train to the last epoch, and write checkpoints.
@@ -274,7 +222,7 @@ class Trainer:
             # Surplus states or GPUs are ignored.
             cuda.set_rng_state_all(self._random_state["cuda"][: cuda.device_count()])
         else:
-            self.averages.begin_epoch(self.initial, self.step.optimizer)
+            self.averages.begin_epoch(self.initial, self.optimizer)
             renders = self._regenerate(rounds[0].number)
             sums = torch.zeros(2, device=self.device)
             self._epoch_state = EpochState(renders, sums, [renders.diagnostics])
@@ -302,7 +250,7 @@ class Trainer:
                     # Each epoch of a soup runs through the whole schedule of the learning rate.
                     if not settings.soup:
                         done = (self.epoch + done) / settings.epochs
-                    state.sums += self.step.take(batch, done, self.epoch * sum(steps) + state.step)
+                    state.sums += self._take_step(batch, done, self.epoch * sum(steps) + state.step)
                     self.averages.end_step()
                     state.step += 1
                     # After its last step, the epoch counts as trained, even if a signal came.
@@ -311,6 +259,33 @@ class Trainer:
                     if state.step < sum(steps) and self._saving_is_due():
                         self._save()
         return True
+
+    def _take_step(self, batch: Batch, done: float, number: int) -> Float[Tensor, " 2"]:
+        """Change the weights by the gradient of the loss of a batch.
+
+        `done` is the fraction of the training that is done, and `number` the number of earlier
+        steps of the run. Return the sum of the losses of the images, and the number of correct
+        predictions.
+        """
+        settings = self.settings
+        for group in self.optimizer.param_groups:
+            group["lr"] = recipe.learning_rate(settings, done)
+        images, labels, rendered = batch
+        augmented = self._augmentation.apply(images, labels, number)
+        tensors = [augmented, labels, rendered]
+        if settings.consistency_weight:
+            # The consistency term compares the images before and after the augmentation.
+            tensors = [images, labels, rendered, augmented]
+        self.optimizer.zero_grad(set_to_none=True)
+        loss, hits = self._loss(*tensors)
+        self.scaler.scale(loss).backward()
+        # The gradient is scaled for float16, and its true norm is clipped.
+        if settings.clip_gradient:
+            self.scaler.unscale_(self.optimizer)
+            nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip_gradient)
+        self.scaler.step(self.optimizer)
+        self.scaler.update()
+        return torch.stack([loss.detach() * len(images), hits])
 
     def _regenerate(self, number: int) -> Renders:
         """Render the training renders of a round anew, and log images of a few attacks on them."""
@@ -351,7 +326,7 @@ class Trainer:
                 self._log.renders(state.renders.images, self.epoch)
         image_count = state.step * self.settings.batch_size
         trained = {"loss": loss_sum / image_count, "accuracy": hits / image_count}
-        trained["learning_rate"] = self.step.optimizer.param_groups[0]["lr"]
+        trained["learning_rate"] = self.optimizer.param_groups[0]["lr"]
         # A phase that this process did not run counts as 0 seconds. The attack is such a
         # phase if the run was resumed after it.
         seconds = dict.fromkeys(run_folder.PHASES, 0.0) | self.phases.take()
@@ -421,7 +396,8 @@ class Trainer:
         return {
             **self._description(),
             "model": self.model.network.state_dict(),
-            **self.step.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "scaler": self.scaler.state_dict(),
             **self.averages.state_dict(),
             "precision": self.model.precision,
             "service": self.service.state_dict(),
@@ -438,7 +414,8 @@ class Trainer:
         self.epoch = state["epoch"]
         self.history = state["history"]
         self.model.network.load_state_dict(state["model"])
-        self.step.load_state_dict(state)
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.scaler.load_state_dict(state["scaler"])
         self.averages.load_state_dict(state)
         for network in (self.model, self.initial, self.selected):
             if network:
@@ -487,15 +464,14 @@ def evaluate(model: nn.Module, split: Split) -> dict[str, float]:
     """
     device = split.labels.device
     # Each of n processes scores every n-th image.
-    own = slice(distributed.rank(), None, distributed.world_size())
-    own_rows = torch.arange(len(split), device=device)[own]
-    batches = own_rows.split(EVALUATION_BATCH)
+    rows = torch.arange(len(split), device=device)[distributed.rank() :: distributed.world_size()]
+    batches = rows.split(EVALUATION_BATCH)
     sums = torch.zeros(2, device=device)
     # With few images, a process has none, and not every network takes an empty batch.
-    if len(own_rows):
+    if len(rows):
         shown = progress(split.squares(batches), f"{len(split)} images", len(batches))
         logits = compute_outputs(model, shown, EVALUATION_BATCH, device)
-        labels = split.labels[own_rows]
+        labels = split.labels[rows]
         loss_sum = F.cross_entropy(logits, labels, reduction="sum")
         sums = torch.stack([loss_sum, (logits.argmax(1) == labels).sum()])
     loss_sum, hits = all_reduce_sum(sums).tolist()

@@ -75,8 +75,8 @@ class Run:
 
     settings: ExperimentSettings
     data: DataSet
+    initial: inputs.Initial | None
     folder: Path
-    initial: inputs.Initial | None = None
     command: str = ""
 
     def __post_init__(self) -> None:

@@ -72,7 +72,7 @@ def test_the_cheapest_best_remedy_is_recommended(light_alone, hardening, both, e
 
 
 def test_a_remedy_is_unknown_without_negatives():
-    without = evaluation_of(evaluation(FEW).pooled.all.positives)
+    without = evaluation_of(evaluation(FEW).pooled.positives)
     assert recommend({ORIGINAL: [without], LIGHT_ALONE: [without]}) is None
 
 

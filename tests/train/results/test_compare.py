@@ -9,7 +9,7 @@ import pytest
 
 from tests.train.helpers import evaluation_of, ranked, read_markdown
 from train.results import compare as comparison
-from train.results.metrics import Pool, Pooled
+from train.results.metrics import Pool
 from train.results.page import write_report
 from train.results.predictions import Predictions, write_predictions
 from train.results.store import ScoredRun, summarize
@@ -222,7 +222,7 @@ def test_without_the_metric_of_one_seed_there_is_no_difference(scored_run):
         for seed, negatives in enumerate(others):
             scores = {"web": ([1, 1], negatives)}
             run = summarize(scored_run(method, scores, f"seed={seed}"))
-            found.append(comparison.Evaluation(run, Pooled(predictions_of(rows_of(scores)))))
+            found.append(comparison.Evaluation(run, Pool(predictions_of(rows_of(scores)))))
         return found
 
     lacking, whole = evaluations("random", [2, 0], []), evaluations("none", [2, 2], [2, 2])

@@ -76,7 +76,7 @@ def test_recall_and_average_precision_are_those_of_coco(seed):
         precision = evaluation.eval["precision"][0, :, label, 0, 2].mean()
         recall = evaluation.eval["recall"][0, label, 0, 2]
         of_label = matches.of([label])
-        assert of_label.average_precision(every) == pytest.approx(precision, abs=1e-12)
+        assert of_label.average_precision(every[0]) == pytest.approx(precision, abs=1e-12)
         assert of_label.recall(0.0, every) == pytest.approx(recall, abs=1e-12)
 
 
@@ -86,7 +86,7 @@ def test_average_precision_of_three_detections_is_that_of_the_definition():
     found = _found(boxes, [0, 0, 0], [0.9, 0.8, 0.7])
     matches = _match([found], [_marked([boxes[0], boxes[2]], [0, 0])])
     expected = (51 * 1 + 50 * 2 / 3) / 101
-    assert matches.average_precision(np.ones((1, 1))) == pytest.approx(expected)
+    assert matches.average_precision(np.ones(1)) == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(

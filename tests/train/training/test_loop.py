@@ -85,7 +85,7 @@ def states_after_steps(trainer: Trainer) -> list[State]:
     def record(*_) -> None:
         states.append(copy.deepcopy(trainer.model.network.state_dict()))
 
-    trainer.step.optimizer.register_step_post_hook(record)
+    trainer.optimizer.register_step_post_hook(record)
     return states
 
 
@@ -207,12 +207,12 @@ def test_each_epoch_of_a_soup_begins_without_the_momentum_of_the_last(tmp_path):
 
 def test_a_run_in_float16_is_resumed_with_its_scale(tmp_path):
     trainer = make_trainer(tmp_path, precision="float16", epochs=1)
-    trainer.step.scaler.load_state_dict(trainer.step.scaler.state_dict() | {"scale": 256.0})
+    trainer.scaler.load_state_dict(trainer.scaler.state_dict() | {"scale": 256.0})
     fit_noise(trainer)
     resumed = make_trainer(tmp_path, precision="float16", epochs=1)
     resumed.resume()
-    assert resumed.step.scaler.get_scale() == 256
-    assert trainer.step.scaler.get_scale() == 256
+    assert resumed.scaler.get_scale() == 256
+    assert trainer.scaler.get_scale() == 256
 
 
 @pytest.mark.parametrize(
