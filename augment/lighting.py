@@ -383,10 +383,11 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
     plain = image.as_subclass(Tensor)
     if plain.ndim == 2:
         return _apply_to_tensor(plain[None], lights, depth)[0]
-    if plain.ndim < 2 or not 1 <= plain.shape[-3] <= 4 or plain.dtype == torch.bool:
+    is_number = plain.dtype != torch.bool and not plain.is_complex()
+    if plain.ndim < 2 or not 1 <= plain.shape[-3] <= 4 or not is_number:
         dtype = str(image.dtype).removeprefix("torch.")
         fault = f"the image is {dtype} of shape {tuple(image.shape)}"
-        raise InputError(f"{fault}: give numbers of shape (..., C, H, W) with 1 to 4 channels")
+        raise InputError(f"{fault}: give real numbers of shape (..., C, H, W) with 1 to 4 channels")
     count = math.prod(_batch_shape(image))
     if not plain.numel() or plain.is_meta or not any(lights):
         return plain

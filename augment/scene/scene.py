@@ -536,8 +536,8 @@ class Scene:
             groups = progress(list(groups), "rendering views")
         for group in groups:
             rows = group.rows
-            behind = self.backgrounds[[self.examples[numbers[row]].background for row in rows]]
-            background = behind.transpose(0, 1).flatten(1)
+            behind = [self.backgrounds[self.examples[numbers[row]].background] for row in rows]
+            background = torch.stack(behind, dim=1).flatten(1)
             shown = numbers[rows[0]], group, background, is_draft
             pixels, coverage, radiance = self._direct_renderer.radiance(*shown)
             # Pixels at the border of the object show a part of the background.
