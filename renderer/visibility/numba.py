@@ -22,7 +22,6 @@ from renderer.visibility.numpy import FAR, SUBSAMPLE_BITS, FaceIds, Faces, Views
 
 # numba also raises ImportError for an unsupported NumPy.
 numba = import_package("numba", "numba, or choose the rasterizer numpy")
-VERSION = numba.__version__
 # Types of the arguments and of the result of `_draw`, for which numba compiles it: positions (2, V)
 # and depths (V,) of the vertices, faces (F, 3), and the index of the nearest face and its depth at
 # each sample.
