@@ -25,6 +25,7 @@ from renderer.errors import require_finite
 from renderer.modes import once_differentiable, without_autocast
 from renderer.settings import ImageSettings
 from renderer.visibility import Rasterizer
+from renderer.visibility.numpy import doubled_areas
 
 # Largest number of samples of the views that are shaded at once on a CPU, into whose cache their
 # values should fit. A larger view is shaded alone.
@@ -472,9 +473,8 @@ def _fragments_of_views(
     # Axes: coordinates x and y, corner, seen face.
     outlines = projected.flatten(0, 1).T[:2].index_select(1, projected_corners)
     outlines = outlines.unflatten(1, (3, -1))
-    (ax, bx, cx), (ay, by, cy) = outlines
-    # A face is seen from behind if its corners are clockwise in the image.
-    is_seen_from_behind = (bx - ax) * (cy - ay) < (cx - ax) * (by - ay)
+    # A face is seen from behind if its corners are clockwise in the image, in which y points up.
+    is_seen_from_behind = doubled_areas(outlines) < 0
     return Fragments(
         shape=settings.shape,
         samples=settings.samples,
