@@ -285,8 +285,6 @@ class _QuadraticProgram:
     def __post_init__(self) -> None:
         """Solve the program without constraints on the radiance, within the bounds or the ball."""
         self._offset = self.original - self.center
-        self._low = np.broadcast_to(self.low, self.original.shape)
-        self._high = np.broadcast_to(self.high, self.original.shape)
         distance = float(np.linalg.norm(self._offset))
         # With this t, the point c + t (v - c) lies on the surface of the ball. Constraints
         # only move the solution closer to the center c, so a smaller t is never needed.
@@ -313,9 +311,10 @@ class _QuadraticProgram:
         """
         pairs = zip(self._active_constraints, new_harmonics, strict=True)
         constraints = [np.concatenate(pair) for pair in pairs]
+        bounds = [np.broadcast_to(end, self.original.shape) for end in (self.low, self.high)]
         for _ in range(_MAX_RADIUS_STEPS):
             target = self._unconstrained_point()
-            channels = zip(target, constraints, self._low, self._high, strict=True)
+            channels = zip(target, constraints, *bounds, strict=True)
             solutions = [_nearest(*channel, self.weights) for channel in channels]
             nearest = np.stack([solution for solution, _ in solutions])
             self._active_constraints = [active for _, active in solutions]
