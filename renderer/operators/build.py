@@ -292,7 +292,7 @@ def _glossy_box_filter(
         # The light passes the coat on its way to the diffuse layer below, and on its way back.
         below_coat = block_gloss.factors_below_coat(diffuse_degree).T
         irradiance = harmonics.basis(normals, diffuse_degree) * below_coat
-        diffuse = irradiance * block_gloss.diffuse_factor(normals, to_camera)[:, None]
+        diffuse = irradiance * block_gloss.diffuse_factor((normals * to_camera).sum(1))[:, None]
         # If all colors share a channel, there is one weight, so the loop leaves out the
         # second channel.
         for channel, weight in zip(block_transfer, weights[samples].T, strict=False):

@@ -396,7 +396,7 @@ def path_reflectance(
     # The reflection of metals (colored) is multiplied by the albedo. All other specular
     # reflection (white) has the color of the light.
     colored, white = path_gloss.reflect_beams(normals, to_camera, to_light)
-    diffuse_factor = gloss.diffuse_factor(surface.normals, surface.toward)[sample]
+    diffuse_factor = gloss.diffuse_factor((surface.normals * surface.toward).sum(1))[sample]
     # The transmittance is the fraction of light that passes the coat to the diffuse layer.
     diffuse = diffuse_factor * path_gloss.coat_transmittance((normals * to_light).sum(1))
     return path_albedo * (diffuse + colored)[:, None] + white[:, None]

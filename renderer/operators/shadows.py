@@ -264,9 +264,9 @@ class Transport:
         albedo_by_channel = albedo.T / fragments.samples**2
         diffuse_albedo = albedo_by_channel
         if gloss is not None:
-            seen = surface.normals, surface.toward
-            diffuse_albedo = albedo_by_channel * gloss.diffuse_factor(*seen)
-            in_uniform_light = gloss.reflect_uniform_light(*seen)
+            cosine = (surface.normals * surface.toward).sum(1)
+            diffuse_albedo = albedo_by_channel * gloss.diffuse_factor(cosine)
+            in_uniform_light = gloss.reflect_uniform_light(cosine)
         channels = range(len(albedo_by_channel))
         skies = [in_light(sky, channel) for channel in channels]
         if self._patches:
