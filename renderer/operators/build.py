@@ -89,11 +89,9 @@ def _build(
     # Three channels are needed if bounced light is colored. They are also needed for a glossy
     # mesh with shadows or local lights, because these add specular reflection, which has no
     # albedo, to the same channel.
-    has_colored_light = transport is not None and transport.has_colored_light
     adds_gloss = is_glossy and (transport is not None or bool(basis.local_lights))
-    albedo, pixel_albedo = _albedo(
-        surface, albedo_scale, dtype, needs_channels=has_colored_light or adds_gloss
-    )
+    needs_channels = adds_gloss or (transport is not None and transport.has_colored_light)
+    albedo, pixel_albedo = _albedo(surface, albedo_scale, dtype, needs_channels)
     # Dense rows of the matrix, shape (C, K, P), after the indices of their coefficients.
     dense: list[tuple[Tensor, Tensor]] = []
     # Rows of the matrix as lists of their nonzero entries.
