@@ -190,9 +190,8 @@ class _MovingView:
         # Radiance times upstream gradient, summed over the color channels.
         weighted_radiance = (self.radiance * upstream_at_samples).sum(0)
         weighted_image = fragments.image_of_samples(weighted_radiance, torch.nan)
-        right, down = (
-            self._gradient_along(axis, weighted_image, upstream_at_samples) for axis in (X, Y)
-        )
+        right = self._gradient_along(X, weighted_image, upstream_at_samples)
+        down = self._gradient_along(Y, weighted_image, upstream_at_samples)
         # Most samples have neighbors of the same color. Their gradient is 0.
         samples = torch.nonzero((right != 0) | (down != 0)).squeeze(1)
         # Gradient with respect to the image position (x, y) of each selected sample. The
@@ -276,14 +275,12 @@ class _MovingView:
         # sample and the pixel of the second sample each gain half of the difference of the two
         # radiances. The factor 1/2 is already in `upstream`.
         toward_second = self.radiance.new_zeros(len(along))
+        is_covered, of_mesh = crossings.samples >= 0, self.radiance[:, crossings.samples]
         for pixels in _pixels_of_cells(crossings.cells, self.fragments):
             # Radiance at both samples, or the background if a sample shows no mesh.
-            first_radiance, second_radiance = (
-                torch.where(samples >= 0, self.radiance[:, samples], self.background[:, pixels])
-                for samples in crossings.samples
-            )
+            radiance = torch.where(is_covered, of_mesh, self.background[:, None, pixels])
             pixel_gradient = upstream[:, column_of_pixel[pixels]]
-            toward_second += (pixel_gradient * (first_radiance - second_radiance)).sum(0)
+            toward_second += (pixel_gradient * (radiance[:, 0] - radiance[:, 1])).sum(0)
         # Gradient with respect to the position (x, y) of each crossing in the image.
         crossing_gradients = (toward_second * along * crossings.normal).T
         # Distances by which a crossing moves if the first, or the second, end of its edge
