@@ -364,9 +364,8 @@ def with_added_albedo(
         if mesh.gloss_textures and gloss.shape[:2] != texture.shape[:2]:
             gloss = _resized(gloss, size, "linear")
         charts = _Charts(mesh.corner_uvs[faces], texture.shape[1::-1])
-        new_texture, new_gloss = (
-            np.zeros((*charts.sheet_size[::-1], old.shape[2]), np.uint8) for old in (texture, gloss)
-        )
+        new_texture = np.zeros((*charts.sheet_size[::-1], 3), np.uint8)
+        new_gloss = np.zeros((*charts.sheet_size[::-1], gloss.shape[2]), np.uint8)
         block_count = 1 + charts.texel_count // SHEET_BLOCK
         for block in np.array_split(np.arange(len(faces)), block_count):
             chart, on_sheet, center = charts.texels(block)
