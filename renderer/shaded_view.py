@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from functools import cached_property, partial, reduce
 from typing import NamedTuple
 
 import torch
@@ -147,10 +147,8 @@ class ShadedView:
         if self.light.environment is not None:
             arguments = (fragments, self.vertices, self.light.environment, self.albedo)
             gloss = sample_gloss(self.mesh, self.fragments, self.gloss)
-            if gloss is None:
-                summands.append(radiance(*arguments, self._normals))
-            else:
-                summands.append(glossy_radiance(*arguments, self._normals, gloss))
+            shade = radiance if gloss is None else partial(glossy_radiance, gloss=gloss)
+            summands.append(shade(*arguments, self._normals))
         # Change of the radiance by shadows and bounces.
         if has_indirect and (indirect := self._indirect_radiance()) is not None:
             summands.append(indirect)
