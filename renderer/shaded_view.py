@@ -7,7 +7,7 @@ sample is covered if it shows the shape.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property, partial, reduce
 from typing import NamedTuple
 
@@ -107,7 +107,7 @@ class ShadedView:
         # Silhouettes move between the mesh and the background, whose linear values are needed.
         background = decode(background, self.settings.encoding).expand(3, -1)
         # Each sample becomes a pixel of a finer image, so that it is shaded alone.
-        finer_fragments = replace(fragments.by_sample(), cameras=(camera,))
+        finer_fragments = fragments.by_sample(camera)
         at_samples = self._sum(finer_fragments, has_indirect=False)
         zeros = at_samples.new_zeros(3, len(fragments.pixels))
         at_pixels = zeros.index_add(1, fragments.sample_to_pixel, at_samples)

@@ -115,10 +115,8 @@ class Fragments:
         """Homogeneous position (x, y, z, w) of the camera of the only view, or of each sample.
 
         w is 1 for the position of a perspective camera, and 0 for the direction
-        to an orthographic camera. Without a camera, all four numbers are 0.
+        to an orthographic camera.
         """
-        if not self.cameras:
-            return torch.zeros(1, 4)
         eyes = torch.stack([camera.differentiable_eye() for camera in self.cameras])
         if len(eyes) == 1:
             return eyes
@@ -202,10 +200,11 @@ class Fragments:
         y = (2 * (rows - row) - 1) / columns - rows / columns
         return torch.stack([x, y]).T
 
-    def by_sample(self) -> "Fragments":
-        """Return a copy for a finer image, in which each sample is a pixel.
+    def by_sample(self, camera: Camera) -> "Fragments":
+        """Return a copy for a finer image of another camera, in which each sample is a pixel.
 
-        The samples keep their order, and the finer image has one sample per pixel.
+        The samples keep their order, and the finer image has one sample per pixel. The camera
+        differs only in its gradients.
         """
         sample_count = len(self.sample_numbers)
         finer = replace(
@@ -215,6 +214,7 @@ class Fragments:
             pixels=self.sample_numbers,
             coverage=self.coverage.new_ones(sample_count),
             sample_to_pixel=torch.arange(sample_count, device=self.sample_numbers.device),
+            cameras=(camera,),
         )
         # The copy does not compute the weights again.
         vars(finer)["barycentric"] = self.barycentric
