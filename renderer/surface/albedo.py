@@ -58,21 +58,21 @@ class Texture:
 
 
 def surface_albedo(
-    mesh: Mesh, fragments: Fragments, encoding: str, textures: Sequence[Tensor] | None = None
+    mesh: Mesh, fragments: Fragments, encoding: str, given: Sequence[Tensor] = ()
 ) -> Float[Tensor, "S 3"]:
     """Compute the albedo of a mesh at the samples of a view that show the mesh.
 
     The albedo is the interpolated color of the face corners times the interpolated
     texture. Colors and texels are decoded to linear values before they are
-    interpolated. `textures` are linear, replace those of the mesh, and get a gradient. The
-    result is linear, too.
+    interpolated. `given` is one albedo per face (F, 3), or textures (rows, columns, 3) that replace
+    those of the mesh. They are linear, and get a gradient. The result is linear, too.
     """
+    if given and given[0].ndim == 2:
+        return face_albedo(given[0], fragments)
     colors = _interpolated_colors(mesh, fragments, encoding)
-    if textures is None:
-        looked_up = mesh_textures(mesh, encoding, fragments.coverage)
-    else:
-        looked_up = [Texture.from_values(values) for values in textures]
-    return colors * sample_textures(looked_up, mesh, fragments).T if looked_up else colors
+    textures = [Texture.from_values(values) for values in given]
+    textures = textures or mesh_textures(mesh, encoding, fragments.coverage)
+    return colors * sample_textures(textures, mesh, fragments).T if textures else colors
 
 
 def sample_textures(
