@@ -311,10 +311,10 @@ class _QuadraticProgram:
         """
         pairs = zip(self._active_constraints, new_harmonics, strict=True)
         constraints = [np.concatenate(pair) for pair in pairs]
-        bounds = [np.broadcast_to(end, self.original.shape) for end in (self.low, self.high)]
+        low, high = (np.broadcast_to(end, self.original.shape) for end in (self.low, self.high))
         for _ in range(_MAX_RADIUS_STEPS):
             target = self._unconstrained_point()
-            channels = zip(target, constraints, *bounds, strict=True)
+            channels = zip(target, constraints, low, high, strict=True)
             solutions = [_nearest(*channel, self.weights) for channel in channels]
             nearest = np.stack([solution for solution, _ in solutions])
             self._active_constraints = [active for _, active in solutions]
