@@ -324,8 +324,7 @@ class OperatorStack:
         coefficients = F.pad(nonzero, (0, len(nonzero) % 2))
         channel_count = max(len(operator.transfer) for operator in operators)
         like = operators[0].transfer
-        shape = (len(operators), channel_count, len(coefficients), len(pixels))
-        transfer = like.new_zeros(shape)
+        transfer = like.new_zeros(len(operators), channel_count, len(coefficients), len(pixels))
         albedo = like.new_ones(len(operators), COLORS, len(pixels))
         coverage = like.new_zeros(len(operators), 1, len(pixels))
         # Nonzero entries of the further rows of each operator.
@@ -336,13 +335,11 @@ class OperatorStack:
             # this operator.
             rows = torch.searchsorted(nonzero, operator.nonzero)
             columns = torch.searchsorted(pixels, operator.pixels)
+            # Three color channels include the albedo. The factors `albedo` then stay 1.
+            channels = operator.by_channel if channel_count == COLORS else operator.transfer
+            transfer[index, : len(channels)][:, rows[:, None], columns] = channels
             if channel_count < COLORS:
-                channels = transfer[index][: len(operator.transfer)]
-                channels[:, rows[:, None], columns] = operator.transfer
                 albedo[index][:, columns] = operator.albedo
-            else:
-                # Three color channels, which include the albedo. The factors `albedo` stay 1.
-                transfer[index][:, rows[:, None], columns] = operator.by_channel
             coverage[index, 0, columns] = operator.coverage
             entries = operator.sparse or no_entries
             self._sparse.append(entries._replace(pixel=columns[entries.pixel]).to(device))
