@@ -325,8 +325,7 @@ def precompute_transfer(
         (torch.Size([2, 3, 16, 16]), torch.Size([2, 2, 3, 16, 16]))
     """
     settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
-    checked = _checked_cameras(mesh, cameras, albedo_scale, gloss)
-    fixed = [camera.fixed() for camera in checked]
+    fixed = [camera.fixed() for camera in _checked_cameras(mesh, cameras, albedo_scale, gloss)]
     all_cameras = showing(fixed, mesh.vertices, mesh.faces)
     shown = mesh, all_cameras, settings, _choose(rasterizer), albedo_scale
     operators = build_operators(*shown, gloss=gloss, device=errors.as_device(device))

@@ -107,8 +107,7 @@ class ShadedView:
         # Silhouettes move between the mesh and the background, whose linear values are needed.
         background = decode(background, self.settings.encoding).expand(3, -1)
         # Each sample becomes a pixel of a finer image, so that it is shaded alone.
-        finer_fragments = fragments.by_sample(camera)
-        at_samples = self._sum(finer_fragments, has_indirect=False)
+        at_samples = self._sum(fragments.by_sample(camera), has_indirect=False)
         zeros = at_samples.new_zeros(3, len(fragments.pixels))
         at_pixels = zeros.index_add(1, fragments.sample_to_pixel, at_samples)
         at_pixels = at_pixels / fragments.samples**2

@@ -149,8 +149,7 @@ def _attributes(
                 raise ValueError(f"{name} has integers without {QUANTIZATION}: export it again")
         attributes[name] = values.astype(np.float64)
     # Each morph target has changes of attributes, which are added with a weight each.
-    targets = primitive.get("targets", [])
-    for weight, target in zip(weights, targets, strict=bool(weights)):
+    for weight, target in zip(weights, primitive.get("targets", []), strict=bool(weights)):
         for name, index in target.items():
             if weight != 0 and name in attributes:
                 change = file.array(index)

@@ -400,8 +400,7 @@ def read_material(file: GltfFile, index: int | None) -> Material:
     for name, factor in TRANSPARENT.items():
         if extensions.get(name, {}).get(factor, 0) > 0:
             raise ValueError(f"a material lets light pass ({name}): make it opaque")
-    mode = entry.get("alphaMode", "OPAQUE")
-    material = Material(np.ones(4), mode, entry.get("alphaCutoff", 0.5))
+    material = Material(np.ones(4), entry.get("alphaMode", "OPAQUE"), entry.get("alphaCutoff", 0.5))
     if SPECULAR_GLOSSINESS in extensions:
         return _specular_glossiness(material, file, extensions[SPECULAR_GLOSSINESS])
     # The model of glTF itself (3.9.2).

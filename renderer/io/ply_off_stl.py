@@ -276,8 +276,7 @@ def read_off(file: MeshFile) -> list[Part]:
     if mesh_file.words_per_line(rows).tolist() != word_counts:
         raise ValueError("a vertex or a face has colors or other numbers: export the mesh as .ply")
     body = mesh_file.parse_numbers(rows, np.float64).tobytes()
-    positions = [_Property(axis, "f8") for axis in "xyz"]
-    vertex, offset = _rows(body, 0, vertex_count, positions, _ASCII)
+    vertex, offset = _rows(body, 0, vertex_count, [_Property(axis, "f8") for axis in "xyz"], _ASCII)
     face, _ = _rows(body, offset, face_count, [_Property("vertex_indices", "i8", "i8")], _ASCII)
     return _parts(file, {"vertex": vertex, "face": face}, [])
 

@@ -402,8 +402,7 @@ def _find_negative_minima(
     index of the light of each minimum, and the harmonics in its direction (D, K).
     """
     degree = math.isqrt(lights.shape[1]) - 1
-    is_coarse = degree <= _COARSE_GRID_DEGREE
-    subdivisions = _COARSE_SUBDIVISIONS if is_coarse else _FINE_SUBDIVISIONS
+    subdivisions = _COARSE_SUBDIVISIONS if degree <= _COARSE_GRID_DEGREE else _FINE_SUBDIVISIONS
     grid_directions, grid_harmonics, grid_neighbors = _grid(degree, subdivisions)
     # Radiance of each light (rows) in each direction of the grid (columns).
     radiance = lights @ grid_harmonics

@@ -266,8 +266,7 @@ def _glossy_box_filter(
     """
     fragments = surface.fragments
     is_shared = albedo.shape[1] == 1
-    channel_count = 2 if is_shared else COLORS
-    shape = channel_count, basis.size, len(fragments.pixels)
+    shape = 2 if is_shared else COLORS, basis.size, len(fragments.pixels)
     transfer = torch.zeros(shape, dtype=dtype, device=albedo.device)
     # Index of the channels to which reflection with the color of the light is added.
     white_channels = 1 if is_shared else slice(None)

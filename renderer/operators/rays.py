@@ -482,8 +482,7 @@ class LocalLightView:
         # With silhouettes, gradients include how surfaces move past the camera and the projector.
         is_moving = shown.cameras is not surface.fragments.cameras
         if surface.gloss is not None and is_moving:
-            seen = replace(surface.fragments, cameras=shown.cameras)
-            surface = replace(surface, fragments=seen)
+            surface = replace(surface, fragments=replace(surface.fragments, cameras=shown.cameras))
         points = surface.points if is_moving else surface.points.detach()
         arriving = basis.arriving(light.cpu().double(), paths, points)
         # Irradiance at the end of each path: one row for each path, one column for each color.

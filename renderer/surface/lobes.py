@@ -224,8 +224,7 @@ def _rotate_harmonics(coefficients: Tensor, angle: Angle) -> Tensor:
 
 def _multiply_bands(rotation: Tensor, coefficients: Tensor) -> Tensor:
     """Rotate SH coefficients by a matrix, which has only one block per degree on its diagonal."""
-    degrees = range(math.isqrt(len(coefficients)))
-    slices = [slice(l * l, (l + 1) * (l + 1)) for l in degrees]
+    slices = [slice(l * l, (l + 1) * (l + 1)) for l in range(math.isqrt(len(coefficients)))]
     return torch.cat([rotation[b, b].to(coefficients) @ coefficients[b] for b in slices])
 
 

@@ -278,8 +278,7 @@ class Fragments:
 
     def to(self, device: torch.device | str) -> "Fragments":
         """Return the fragments with all tensors on a device."""
-        is_there = self.pixels.device == torch.device(device)
-        return self if is_there else on_device(self, device)
+        return self if self.pixels.device == torch.device(device) else on_device(self, device)
 
 
 def on_device(parts: Any, device: torch.device | str) -> Any:

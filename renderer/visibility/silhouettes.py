@@ -137,8 +137,7 @@ class _ZerosWithGradient(torch.autograd.Function):
         """Create the zeros, and store the view and the homogeneous positions (x w, y w, w)."""
         ctx.save_for_backward(positions)
         ctx.view = view
-        pixel_count = len(view.fragments.pixels) + len(view.uncovered_pixels)
-        return view.radiance.new_zeros(3, pixel_count)
+        return view.radiance.new_zeros(3, len(view.fragments.pixels) + len(view.uncovered_pixels))
 
     @staticmethod
     @once_differentiable
@@ -437,8 +436,7 @@ def _cut_edges(
     # crosses. The index of an edge is repeated for all lines that it crosses.
     edge = torch.repeat_interleave(cuts_per_edge)
     cuts_before_edge = cuts_per_edge.cumsum(0) - cuts_per_edge
-    cut = torch.arange(len(edge), device=edge.device)
-    line = cut - (cuts_before_edge - first_line)[edge]
+    line = torch.arange(len(edge), device=edge.device) - (cuts_before_edge - first_line)[edge]
     # Position of the crossing on the edge, from 0 at the start of the edge to 1 at its end.
     fraction = (line - start[0, edge]) / (end[0] - start[0])[edge]
     position = start[1, edge] + fraction * (end[1] - start[1])[edge]
