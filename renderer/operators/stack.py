@@ -205,16 +205,12 @@ class TransferOperators(Sequence[TransferOperator]):
     @cached_property
     def _stacks(self) -> list[OperatorStack]:
         """Stacks of at most `_operators_per_stack` operators, which hold all operators."""
-        device = self._operators[0].transfer.device
-        stacks = []
-        # The stacks are kept, and later calls may need gradients.
+        device, size = self._operators[0].transfer.device, self._operators_per_stack
+        groups = [self._operators[first : first + size] for first in range(0, len(self), size)]
+        # The stacks are kept, and later calls may need gradients. Image i of a stack shows
+        # operator i.
         with torch.inference_mode(False):
-            for start in range(0, len(self), self._operators_per_stack):
-                operators = self._operators[start : start + self._operators_per_stack]
-                # Image i of a stack shows operator i.
-                operator_of_image = torch.arange(len(operators))
-                stacks.append(OperatorStack(operators, operator_of_image, device))
-        return stacks
+            return [OperatorStack(each, torch.arange(len(each)), device) for each in groups]
 
     def _stacked_images(
         self,
