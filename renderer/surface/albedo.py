@@ -32,15 +32,13 @@ class Texture:
     """Texture with C channels, whose texels are looked up by index.
 
     Attributes:
-        height: Number of rows. Row 0 is at the top.
-        width: Number of columns.
+        size: Height and width, the numbers of rows and columns. Row 0 is at the top.
         look_up: Function that takes the indices of N texels, shape (N,), and
             returns their linear values, shape (C, N). The index of a texel is
             row · width + column.
     """
 
-    height: int
-    width: int
+    size: tuple[int, ...]
     look_up: Callable[[Tensor], Tensor]
 
     @staticmethod
@@ -53,8 +51,7 @@ class Texture:
         require_bounded(texture=values)
         # One row for each channel, with all texels in row-major order.
         channels = values.flatten(0, 1).T
-        height, width = values.shape[:2]
-        return Texture(height, width, partial(torch.index_select, channels, 1))
+        return Texture(values.shape[:2], partial(torch.index_select, channels, 1))
 
 
 def surface_albedo(
@@ -124,11 +121,12 @@ def _surrounding_texels(texture: Texture, uvs: Float[Tensor, "2 N"]) -> list[tup
     left and lower right texel.
     """
     u, v = uvs
+    height, width = texture.size
     # The coordinate v points up, but row 0 of the texture is at the top.
-    rows = _neighbors(1 - v, texture.height)
-    columns = _neighbors(u, texture.width)
+    rows = _neighbors(1 - v, height)
+    columns = _neighbors(u, width)
     return [
-        (row_weight * column_weight, (row * texture.width + column).long())
+        (row_weight * column_weight, (row * width + column).long())
         for row, row_weight in rows
         for column, column_weight in columns
     ]
@@ -161,12 +159,8 @@ def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:
         eight_bit_values = all_texels.index_select(0, texels).int().flatten()
         return linear_values.index_select(0, eight_bit_values).view(-1, 3).T
 
-    textures = []
-    for texture in mesh.textures:
-        height, width = texture.shape[:2]
-        all_texels = torch.from_numpy(texture).to(like.device).flatten(0, 1)
-        textures.append(Texture(height, width, partial(look_up, all_texels)))
-    return textures
+    textures = (torch.from_numpy(texture).to(like.device) for texture in mesh.textures)
+    return [Texture(each.shape[:2], partial(look_up, each.flatten(0, 1))) for each in textures]
 
 
 def face_albedo(albedo: Float[Tensor, "F 3"], fragments: Fragments) -> Float[Tensor, "S 3"]:
