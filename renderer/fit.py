@@ -197,8 +197,7 @@ def fit_scene(
         starts = [start.fixed()]
     else:
         # A search in a small copy of the photograph is faster.
-        coarse_size = min(COARSE_SIZE, size)
-        coarse_target = _Target(photograph, mask, mesh, coarse_size, options)
+        coarse_target = _Target(photograph, mask, mesh, min(COARSE_SIZE, size), options)
         starts = _plausible_cameras(coarse_target, mask, fov)
     _, camera = target.rank_cameras(target.refine_camera(camera) for camera in starts)[0]
     # Bounces are slow to compute, so only the returned light is fitted with bounces.

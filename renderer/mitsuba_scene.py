@@ -123,8 +123,7 @@ def render_mitsuba_scene(path: Path, views: int, shape: tuple[int, int]) -> torc
         rendered = [np.array(module.render(scene, sensor=view)) for view in range(views)]
     images = [torch.from_numpy(image).permute(2, 0, 1)[None] for image in rendered]
     # Mitsuba's pixels are square. Those of the camera may have another aspect ratio.
-    resized = [F.interpolate(one, shape, mode="bilinear", antialias=True) for one in images]
-    return torch.cat(resized)
+    return torch.cat([F.interpolate(one, shape, mode="bilinear", antialias=True) for one in images])
 
 
 def mitsuba_map(coefficients: torch.Tensor, height: int) -> torch.Tensor:

@@ -152,8 +152,7 @@ class _AreaVectors(torch.autograd.Function):
         corner_gradients = torch.cat([-second - third, second, third], dim=1)
         # Add up the gradients of all corners that lie at the same vertex.
         zeros = corner_gradients.new_zeros(3, ctx.vertex_shape[0])
-        gradient = zeros.index_add_(1, faces.T.flatten(), corner_gradients)
-        return gradient.to(ctx.dtype).T, None
+        return zeros.index_add_(1, faces.T.flatten(), corner_gradients).to(ctx.dtype).T, None
 
 
 def _length(vectors: Vectors) -> Float[Tensor, " N"]:

@@ -34,10 +34,10 @@ from renderer.pinhole import PinholeCamera
 from renderer.settings import ImageSettings, Size, samples_per_side
 from renderer.shaded_view import ShadedView
 from renderer.solids import sphere
-from renderer.surface.albedo import face_albedo, surface_albedo
+from renderer.surface.albedo import surface_albedo
 from renderer.surface.gloss import Gloss
 from renderer.visibility import choose
-from renderer.visibility.fragments import Fragments, build_fragments, views_at_once
+from renderer.visibility.fragments import build_fragments, views_at_once
 
 # Type of a local light for `render`: a `Lamps` or a `Projector` object, alone or in a pair with its
 # coefficients.
@@ -163,7 +163,7 @@ def render(
         # In coordinates of the earth, float32 would round vertices to meters.
         like = like.double()
     light = None if light is None else light.to(like)
-    albedo = None if albedo is None else albedo.to(like.device)
+    albedos = [] if albedo is None else [albedo.to(like.device)]
     split = SplitLight(light, [(basis, values.to(like)) for basis, values in local_lights])
 
     if mesh.origin.any() and is_movable:
@@ -214,7 +214,7 @@ def render(
                 fragments=fragments,
                 settings=settings,
                 vertices=vertices,
-                albedo=_sample_albedo(mesh, fragments, albedo, encoding).to(like) * albedo_scale,
+                albedo=surface_albedo(mesh, fragments, encoding, albedos).to(like) * albedo_scale,
                 light=split,
                 lamp_view=lamp_view,
                 gloss=gloss,
@@ -325,8 +325,7 @@ def precompute_transfer(
         (torch.Size([2, 3, 16, 16]), torch.Size([2, 2, 3, 16, 16]))
     """
     settings = ImageSettings(size, samples, encoding, normals, shadows, bounces)
-    checked = _checked_cameras(mesh, cameras, albedo_scale, gloss)
-    fixed = [camera.fixed() for camera in checked]
+    fixed = [camera.fixed() for camera in _checked_cameras(mesh, cameras, albedo_scale, gloss)]
     all_cameras = showing(fixed, mesh.vertices, mesh.faces)
     shown = mesh, all_cameras, settings, _choose(rasterizer), albedo_scale
     operators = build_operators(*shown, gloss=gloss, device=errors.as_device(device))
@@ -428,12 +427,3 @@ def _recolored(mesh: Mesh, albedo: Float[Tensor, " ..."], encoding: str) -> Mesh
     corner_colors = colors[:, None].repeat(3, axis=1).astype(np.float32)
     untextured = np.full_like(mesh.texture_ids, NO_TEXTURE)
     return replace(mesh, corner_colors=corner_colors, texture_ids=untextured, textures=())
-
-
-def _sample_albedo(
-    mesh: Mesh, view: Fragments, albedo: Float[Tensor, " ..."] | None, encoding: str
-) -> Float[Tensor, "S 3"]:
-    """Compute linear albedo at samples from one color per face, a texture, or None (the mesh's)."""
-    if albedo is not None and albedo.shape == mesh.faces.shape:
-        return face_albedo(albedo, view)
-    return surface_albedo(mesh, view, encoding, None if albedo is None else [albedo])

@@ -7,8 +7,8 @@ sample is covered if it shows the shape.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cached_property, reduce
+from dataclasses import dataclass
+from functools import cached_property, partial, reduce
 from typing import NamedTuple
 
 import torch
@@ -107,8 +107,7 @@ class ShadedView:
         # Silhouettes move between the mesh and the background, whose linear values are needed.
         background = decode(background, self.settings.encoding).expand(3, -1)
         # Each sample becomes a pixel of a finer image, so that it is shaded alone.
-        finer_fragments = replace(fragments.by_sample(), cameras=(camera,))
-        at_samples = self._sum(finer_fragments, has_indirect=False)
+        at_samples = self._sum(fragments.by_sample(camera), has_indirect=False)
         zeros = at_samples.new_zeros(3, len(fragments.pixels))
         at_pixels = zeros.index_add(1, fragments.sample_to_pixel, at_samples)
         at_pixels = at_pixels / fragments.samples**2
@@ -147,10 +146,8 @@ class ShadedView:
         if self.light.environment is not None:
             arguments = (fragments, self.vertices, self.light.environment, self.albedo)
             gloss = sample_gloss(self.mesh, self.fragments, self.gloss)
-            if gloss is None:
-                summands.append(radiance(*arguments, self._normals))
-            else:
-                summands.append(glossy_radiance(*arguments, self._normals, gloss))
+            shade = radiance if gloss is None else partial(glossy_radiance, gloss=gloss)
+            summands.append(shade(*arguments, self._normals))
         # Change of the radiance by shadows and bounces.
         if has_indirect and (indirect := self._indirect_radiance()) is not None:
             summands.append(indirect)

@@ -183,8 +183,7 @@ def bottle(rng: Random) -> Mesh:
     # Points (radius, height) of the four sections of the profile.
     base = [(0, -1), (radius, -1), (radius, -0.75)]
     label = [(radius, -0.15)]
-    shoulder = arc((0.1, shoulder_height - 0.05), (radius - 0.1, 0.35), 0, 85)
-    neck = np.concatenate([shoulder, [(0.1, 0.8)]])
+    neck = [*arc((0.1, shoulder_height - 0.05), (radius - 0.1, 0.35), 0, 85), (0.1, 0.8)]
     cap = [(0.125, 0.8), (0.125, 1), (0, 1)]
     glass = draw(rng, (0.1, 0.36, 0.16), (0.36, 0.18, 0.06), (0.2, 0.42, 0.6), (0.62, 0.74, 0.74))
     paper = draw(rng, (0.93, 0.9, 0.8), (0.85, 0.2, 0.15), (0.92, 0.78, 0.25))

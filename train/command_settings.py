@@ -303,6 +303,9 @@ class EvaluateSettings(TaskSettings):
     def __post_init__(self) -> None:
         """Check all values, and that the settings name one network."""
         super().__post_init__()
+        require_calibration(self.false_positive_rate, self.calibrate)
+        if self.label is not None:
+            common.label_names(self.label)  # This call only checks the label.
         # With `run`, `network` may only name the function that built the network of the run.
         builds_run = (self.network or "").startswith(scenes.PYTHON)
         if (self.run is None) == (self.network is None) and not (self.run and builds_run):

@@ -77,8 +77,7 @@ def sensor(
 def sensor_of(camera: Camera, size: Size) -> Scene:
     """Convert a camera of this renderer to a camera of Mitsuba."""
     if not isinstance(camera, PerspectiveCamera):
-        pose = pose_of(camera, camera.width / 2)
-        return sensor(pose, size, {"type": "orthographic"})
+        return sensor(pose_of(camera, camera.width / 2), size, {"type": "orthographic"})
     lens: Scene = {"type": "perspective", "fov": camera.angle}
     # By default, Mitsuba shows nothing nearer than 0.01 or farther than 10,000 units.
     lens |= {"near_clip": min(0.01, camera.near), "far_clip": max(1e4, camera.far)}

@@ -167,8 +167,6 @@ def _elements(content: bytes) -> tuple[dict[str, _Values], list[str]]:
                 pass
             case _:
                 raise ValueError(f"the header has an unknown line: {line}")
-    if form not in _BYTE_ORDERS:
-        raise ValueError(f"the format is {form}: choose {', '.join(_BYTE_ORDERS)}")
     body = content[header.end() :]
     # Text becomes float64 numbers, which are then read like a binary file.
     if form == _ASCII:
@@ -278,8 +276,7 @@ def read_off(file: MeshFile) -> list[Part]:
     if mesh_file.words_per_line(rows).tolist() != word_counts:
         raise ValueError("a vertex or a face has colors or other numbers: export the mesh as .ply")
     body = mesh_file.parse_numbers(rows, np.float64).tobytes()
-    positions = [_Property(axis, "f8") for axis in "xyz"]
-    vertex, offset = _rows(body, 0, vertex_count, positions, _ASCII)
+    vertex, offset = _rows(body, 0, vertex_count, [_Property(axis, "f8") for axis in "xyz"], _ASCII)
     face, _ = _rows(body, offset, face_count, [_Property("vertex_indices", "i8", "i8")], _ASCII)
     return _parts(file, {"vertex": vertex, "face": face}, [])
 

@@ -266,8 +266,7 @@ def mean_luminance(coefficients: Float[Tensor, "K 3"]) -> float:
 
     Only the first row counts.
     """
-    weights = torch.tensor(LUMINANCE, dtype=torch.float64)
-    return float(coefficients[0].cpu().double() @ weights)
+    return float(coefficients[0].cpu().double() @ torch.tensor(LUMINANCE, dtype=torch.float64))
 
 
 def _read_light_map(path: Path, degree: int, roughness: float | None) -> Tensor:

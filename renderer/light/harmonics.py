@@ -329,6 +329,14 @@ def bands(degree: int) -> Int[Tensor, " coefficients"]:
     return torch.arange(degree + 1).repeat_interleave(2 * torch.arange(degree + 1) + 1)
 
 
+@cache_tensors
+def rows_and_orders(degree: int) -> tuple[Tensor, Tensor]:
+    """Find the row l (l + 1) / 2 + |m| in a list of the orders m ≥ 0, and m, of each harmonic."""
+    l = bands(degree)
+    m = torch.arange(len(l)) - l * (l + 1)
+    return l * (l + 1) // 2 + m.abs(), m
+
+
 def lambertian_factors(degree: int) -> Float64[Tensor, " coefficients"]:
     """Compute the factor A_l of each SH coefficient of a light in the irradiance.
 

@@ -285,8 +285,6 @@ class _QuadraticProgram:
     def __post_init__(self) -> None:
         """Solve the program without constraints on the radiance, within the bounds or the ball."""
         self._offset = self.original - self.center
-        self._low = np.broadcast_to(self.low, self.original.shape)
-        self._high = np.broadcast_to(self.high, self.original.shape)
         distance = float(np.linalg.norm(self._offset))
         # With this t, the point c + t (v - c) lies on the surface of the ball. Constraints
         # only move the solution closer to the center c, so a smaller t is never needed.
@@ -313,9 +311,10 @@ class _QuadraticProgram:
         """
         pairs = zip(self._active_constraints, new_harmonics, strict=True)
         constraints = [np.concatenate(pair) for pair in pairs]
+        low, high = (np.broadcast_to(end, self.original.shape) for end in (self.low, self.high))
         for _ in range(_MAX_RADIUS_STEPS):
             target = self._unconstrained_point()
-            channels = zip(target, constraints, self._low, self._high, strict=True)
+            channels = zip(target, constraints, low, high, strict=True)
             solutions = [_nearest(*channel, self.weights) for channel in channels]
             nearest = np.stack([solution for solution, _ in solutions])
             self._active_constraints = [active for _, active in solutions]
@@ -403,8 +402,7 @@ def _find_negative_minima(
     index of the light of each minimum, and the harmonics in its direction (D, K).
     """
     degree = math.isqrt(lights.shape[1]) - 1
-    is_coarse = degree <= _COARSE_GRID_DEGREE
-    subdivisions = _COARSE_SUBDIVISIONS if is_coarse else _FINE_SUBDIVISIONS
+    subdivisions = _COARSE_SUBDIVISIONS if degree <= _COARSE_GRID_DEGREE else _FINE_SUBDIVISIONS
     grid_directions, grid_harmonics, grid_neighbors = _grid(degree, subdivisions)
     # Radiance of each light (rows) in each direction of the grid (columns).
     radiance = lights @ grid_harmonics

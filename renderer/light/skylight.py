@@ -28,21 +28,18 @@ from torch import Tensor
 
 from renderer.errors import InputError, as_tensor, require_finite
 from renderer.light.basis import HARMONICS
+from renderer.light.harmonics import rows_and_orders
 from renderer.modes import once_differentiable, without_autocast
 from renderer.settings import TURBIDITY
 
 # Smallest and largest zenith angle of the sun in degrees: from overhead to the horizon.
 ZENITH = (0.0, 90.0)
 
-# Degree l and order m of each of the 49 SH coefficients.
-_BANDS_AND_ORDERS = [(l, m) for l in range(HARMONICS.degree + 1) for m in range(-l, l + 1)]
-# Order m of each coefficient, shape (49,).
-_ORDERS = torch.tensor([m for _, m in _BANDS_AND_ORDERS])
+# Index of the polynomial of each of the 49 SH coefficients in the fitted sky, and their orders m.
+# The orders m and -m have the same polynomial.
+_ROW_IN_FIT, _ORDERS = rows_and_orders(HARMONICS.degree)
 # Index of the coefficient of order -m, for each coefficient of order m.
-_OPPOSITE_ORDER = torch.tensor([l * l + l - m for l, m in _BANDS_AND_ORDERS])
-# Index of the polynomial of each SH coefficient in the fitted sky. The orders m and -m have
-# the same polynomial.
-_ROW_IN_FIT = torch.tensor([l * (l + 1) // 2 + abs(m) for l, m in _BANDS_AND_ORDERS])
+_OPPOSITE_ORDER = torch.arange(len(_ORDERS)) - 2 * _ORDERS
 
 
 @without_autocast

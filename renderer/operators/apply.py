@@ -197,8 +197,7 @@ class TransferOperator:
         lights = self.require_lights(lights).detach()
         if isinstance(background, Tensor):
             background = background.detach()
-        prepared = self._prepare_background(background, lights)
-        images, covered = self._images(lights, prepared)
+        images, covered = self._images(lights, self._prepare_background(background, lights))
         image_gradient = loss_gradient(images)
         require_image_gradient(image_gradient, images)
         return images, self._gradient_of_images(image_gradient.detach(), covered)
@@ -377,8 +376,7 @@ class TransferOperator:
             # number in memory.
             at_pixels = at_pixels.expand(*lights.shape[:-2], *at_pixels.shape[-2:]).contiguous()
         coverage = self.coverage.to(images)[None]
-        term = background_term(coverage, at_pixels, self.settings.encoding)
-        prepared = (images, term)
+        prepared = (images, background_term(coverage, at_pixels, self.settings.encoding))
         if is_kept:
             vars(self)["_last_background"] = key, prepared
         return prepared

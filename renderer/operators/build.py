@@ -89,11 +89,9 @@ def _build(
     # Three channels are needed if bounced light is colored. They are also needed for a glossy
     # mesh with shadows or local lights, because these add specular reflection, which has no
     # albedo, to the same channel.
-    has_colored_light = transport is not None and transport.has_colored_light
     adds_gloss = is_glossy and (transport is not None or bool(basis.local_lights))
-    albedo, pixel_albedo = _albedo(
-        surface, albedo_scale, dtype, needs_channels=has_colored_light or adds_gloss
-    )
+    needs_channels = adds_gloss or (transport is not None and transport.has_colored_light)
+    albedo, pixel_albedo = _albedo(surface, albedo_scale, dtype, needs_channels)
     # Dense rows of the matrix, shape (C, K, P), after the indices of their coefficients.
     dense: list[tuple[Tensor, Tensor]] = []
     # Rows of the matrix as lists of their nonzero entries.
@@ -268,8 +266,7 @@ def _glossy_box_filter(
     """
     fragments = surface.fragments
     is_shared = albedo.shape[1] == 1
-    channel_count = 2 if is_shared else COLORS
-    shape = channel_count, basis.size, len(fragments.pixels)
+    shape = 2 if is_shared else COLORS, basis.size, len(fragments.pixels)
     transfer = torch.zeros(shape, dtype=dtype, device=albedo.device)
     # Index of the channels to which reflection with the color of the light is added.
     white_channels = 1 if is_shared else slice(None)
@@ -292,7 +289,7 @@ def _glossy_box_filter(
         # The light passes the coat on its way to the diffuse layer below, and on its way back.
         below_coat = block_gloss.factors_below_coat(diffuse_degree).T
         irradiance = harmonics.basis(normals, diffuse_degree) * below_coat
-        diffuse = irradiance * block_gloss.diffuse_factor(normals, to_camera)[:, None]
+        diffuse = irradiance * block_gloss.diffuse_factor((normals * to_camera).sum(1))[:, None]
         # If all colors share a channel, there is one weight, so the loop leaves out the
         # second channel.
         for channel, weight in zip(block_transfer, weights[samples].T, strict=False):

@@ -396,7 +396,7 @@ def path_reflectance(
     # The reflection of metals (colored) is multiplied by the albedo. All other specular
     # reflection (white) has the color of the light.
     colored, white = path_gloss.reflect_beams(normals, to_camera, to_light)
-    diffuse_factor = gloss.diffuse_factor(surface.normals, surface.toward)[sample]
+    diffuse_factor = gloss.diffuse_factor((surface.normals * surface.toward).sum(1))[sample]
     # The transmittance is the fraction of light that passes the coat to the diffuse layer.
     diffuse = diffuse_factor * path_gloss.coat_transmittance((normals * to_light).sum(1))
     return path_albedo * (diffuse + colored)[:, None] + white[:, None]
@@ -482,8 +482,7 @@ class LocalLightView:
         # With silhouettes, gradients include how surfaces move past the camera and the projector.
         is_moving = shown.cameras is not surface.fragments.cameras
         if surface.gloss is not None and is_moving:
-            seen = replace(surface.fragments, cameras=shown.cameras)
-            surface = replace(surface, fragments=seen)
+            surface = replace(surface, fragments=replace(surface.fragments, cameras=shown.cameras))
         points = surface.points if is_moving else surface.points.detach()
         arriving = basis.arriving(light.cpu().double(), paths, points)
         # Irradiance at the end of each path: one row for each path, one column for each color.

@@ -136,8 +136,7 @@ class Patches:
             # The artificial image has a single sample position, where all samples lie.
             sample_numbers=torch.zeros_like(sample_to_piece),
         )
-        smallest = torch.finfo(areas.dtype).tiny
-        fractions = areas / patch_areas.clamp(min=smallest)[sample_to_patch]
+        fractions = areas / patch_areas.clamp(min=torch.finfo(areas.dtype).tiny)[sample_to_patch]
         # One row for the fronts of all faces, one for their backs. A closed mesh has no row
         # for backs, because rays never hit them. `expand` then repeats the first row.
         patch_by_side = torch.from_numpy(patch_of_side).view(len(sides), -1).expand(2, -1)
@@ -264,9 +263,9 @@ class Transport:
         albedo_by_channel = albedo.T / fragments.samples**2
         diffuse_albedo = albedo_by_channel
         if gloss is not None:
-            seen = surface.normals, surface.toward
-            diffuse_albedo = albedo_by_channel * gloss.diffuse_factor(*seen)
-            in_uniform_light = gloss.reflect_uniform_light(*seen)
+            cosine = (surface.normals * surface.toward).sum(1)
+            diffuse_albedo = albedo_by_channel * gloss.diffuse_factor(cosine)
+            in_uniform_light = gloss.reflect_uniform_light(cosine)
         channels = range(len(albedo_by_channel))
         skies = [in_light(sky, channel) for channel in channels]
         if self._patches:
@@ -274,8 +273,7 @@ class Transport:
             sent = [in_light(color, channel) for channel, color in enumerate(colors)]
         for blocked in self.rays.blocked(surface, directions):
             if change is None:
-                shape = (len(channels), skies[0].shape[1], len(fragments.pixels))
-                change = sky.new_zeros(shape)
+                change = sky.new_zeros(len(channels), skies[0].shape[1], len(fragments.pixels))
             if gloss is not None:
                 shown = gloss, surface, in_uniform_light, blocked, directions
                 metallic, white, transmittance = _reflect_rays(*shown)

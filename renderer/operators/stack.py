@@ -205,16 +205,12 @@ class TransferOperators(Sequence[TransferOperator]):
     @cached_property
     def _stacks(self) -> list[OperatorStack]:
         """Stacks of at most `_operators_per_stack` operators, which hold all operators."""
-        device = self._operators[0].transfer.device
-        stacks = []
-        # The stacks are kept, and later calls may need gradients.
+        device, size = self._operators[0].transfer.device, self._operators_per_stack
+        groups = [self._operators[first : first + size] for first in range(0, len(self), size)]
+        # The stacks are kept, and later calls may need gradients. Image i of a stack shows
+        # operator i.
         with torch.inference_mode(False):
-            for start in range(0, len(self), self._operators_per_stack):
-                operators = self._operators[start : start + self._operators_per_stack]
-                # Image i of a stack shows operator i.
-                operator_of_image = torch.arange(len(operators))
-                stacks.append(OperatorStack(operators, operator_of_image, device))
-        return stacks
+            return [OperatorStack(each, torch.arange(len(each)), device) for each in groups]
 
     def _stacked_images(
         self,
@@ -324,8 +320,7 @@ class OperatorStack:
         coefficients = F.pad(nonzero, (0, len(nonzero) % 2))
         channel_count = max(len(operator.transfer) for operator in operators)
         like = operators[0].transfer
-        shape = (len(operators), channel_count, len(coefficients), len(pixels))
-        transfer = like.new_zeros(shape)
+        transfer = like.new_zeros(len(operators), channel_count, len(coefficients), len(pixels))
         albedo = like.new_ones(len(operators), COLORS, len(pixels))
         coverage = like.new_zeros(len(operators), 1, len(pixels))
         # Nonzero entries of the further rows of each operator.
@@ -336,13 +331,11 @@ class OperatorStack:
             # this operator.
             rows = torch.searchsorted(nonzero, operator.nonzero)
             columns = torch.searchsorted(pixels, operator.pixels)
+            # Three color channels include the albedo. The factors `albedo` then stay 1.
+            channels = operator.by_channel if channel_count == COLORS else operator.transfer
+            transfer[index, : len(channels)][:, rows[:, None], columns] = channels
             if channel_count < COLORS:
-                channels = transfer[index][: len(operator.transfer)]
-                channels[:, rows[:, None], columns] = operator.transfer
                 albedo[index][:, columns] = operator.albedo
-            else:
-                # Three color channels, which include the albedo. The factors `albedo` stay 1.
-                transfer[index][:, rows[:, None], columns] = operator.by_channel
             coverage[index, 0, columns] = operator.coverage
             entries = operator.sparse or no_entries
             self._sparse.append(entries._replace(pixel=columns[entries.pixel]).to(device))

@@ -32,15 +32,13 @@ class Texture:
     """Texture with C channels, whose texels are looked up by index.
 
     Attributes:
-        height: Number of rows. Row 0 is at the top.
-        width: Number of columns.
+        size: Height and width, the numbers of rows and columns. Row 0 is at the top.
         look_up: Function that takes the indices of N texels, shape (N,), and
             returns their linear values, shape (C, N). The index of a texel is
             row · width + column.
     """
 
-    height: int
-    width: int
+    size: tuple[int, ...]
     look_up: Callable[[Tensor], Tensor]
 
     @staticmethod
@@ -53,26 +51,25 @@ class Texture:
         require_bounded(texture=values)
         # One row for each channel, with all texels in row-major order.
         channels = values.flatten(0, 1).T
-        height, width = values.shape[:2]
-        return Texture(height, width, partial(torch.index_select, channels, 1))
+        return Texture(values.shape[:2], partial(torch.index_select, channels, 1))
 
 
 def surface_albedo(
-    mesh: Mesh, fragments: Fragments, encoding: str, textures: Sequence[Tensor] | None = None
+    mesh: Mesh, fragments: Fragments, encoding: str, given: Sequence[Tensor] = ()
 ) -> Float[Tensor, "S 3"]:
     """Compute the albedo of a mesh at the samples of a view that show the mesh.
 
     The albedo is the interpolated color of the face corners times the interpolated
     texture. Colors and texels are decoded to linear values before they are
-    interpolated. `textures` are linear, replace those of the mesh, and get a gradient. The
-    result is linear, too.
+    interpolated. `given` is one albedo per face (F, 3), or textures (rows, columns, 3) that replace
+    those of the mesh. They are linear, and get a gradient. The result is linear, too.
     """
+    if given and given[0].ndim == 2:
+        return face_albedo(given[0], fragments)
     colors = _interpolated_colors(mesh, fragments, encoding)
-    if textures is None:
-        looked_up = mesh_textures(mesh, encoding, fragments.coverage)
-    else:
-        looked_up = [Texture.from_values(values) for values in textures]
-    return colors * sample_textures(looked_up, mesh, fragments).T if looked_up else colors
+    textures = [Texture.from_values(values) for values in given]
+    textures = textures or mesh_textures(mesh, encoding, fragments.coverage)
+    return colors * sample_textures(textures, mesh, fragments).T if textures else colors
 
 
 def sample_textures(
@@ -124,11 +121,12 @@ def _surrounding_texels(texture: Texture, uvs: Float[Tensor, "2 N"]) -> list[tup
     left and lower right texel.
     """
     u, v = uvs
+    height, width = texture.size
     # The coordinate v points up, but row 0 of the texture is at the top.
-    rows = _neighbors(1 - v, texture.height)
-    columns = _neighbors(u, texture.width)
+    rows = _neighbors(1 - v, height)
+    columns = _neighbors(u, width)
     return [
-        (row_weight * column_weight, (row * texture.width + column).long())
+        (row_weight * column_weight, (row * width + column).long())
         for row, row_weight in rows
         for column, column_weight in columns
     ]
@@ -161,12 +159,8 @@ def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:
         eight_bit_values = all_texels.index_select(0, texels).int().flatten()
         return linear_values.index_select(0, eight_bit_values).view(-1, 3).T
 
-    textures = []
-    for texture in mesh.textures:
-        height, width = texture.shape[:2]
-        all_texels = torch.from_numpy(texture).to(like.device).flatten(0, 1)
-        textures.append(Texture(height, width, partial(look_up, all_texels)))
-    return textures
+    textures = (torch.from_numpy(texture).to(like.device) for texture in mesh.textures)
+    return [Texture(each.shape[:2], partial(look_up, each.flatten(0, 1))) for each in textures]
 
 
 def face_albedo(albedo: Float[Tensor, "F 3"], fragments: Fragments) -> Float[Tensor, "S 3"]:
@@ -364,9 +358,8 @@ def with_added_albedo(
         if mesh.gloss_textures and gloss.shape[:2] != texture.shape[:2]:
             gloss = _resized(gloss, size, "linear")
         charts = _Charts(mesh.corner_uvs[faces], texture.shape[1::-1])
-        new_texture, new_gloss = (
-            np.zeros((*charts.sheet_size[::-1], old.shape[2]), np.uint8) for old in (texture, gloss)
-        )
+        new_texture = np.zeros((*charts.sheet_size[::-1], 3), np.uint8)
+        new_gloss = np.zeros((*charts.sheet_size[::-1], gloss.shape[2]), np.uint8)
         block_count = 1 + charts.texel_count // SHEET_BLOCK
         for block in np.array_split(np.arange(len(faces)), block_count):
             chart, on_sheet, center = charts.texels(block)

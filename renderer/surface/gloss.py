@@ -193,12 +193,12 @@ class SampleGloss(NamedTuple):
         # unchanged in the second term.
         return self.metallic * schlick, white + self.metallic * edge
 
-    def reflect_uniform_light(
-        self, normals: Float[Tensor, "S 3"], toward: Float[Tensor, "_ 3"]
-    ) -> Float[Tensor, " S"]:
-        """Compute the specular radiance of white samples under uniform light of irradiance 1."""
-        cosine = (normals * toward).sum(1).clamp(0, 1)
-        colored, white = self.lobes(cosine, degree=0)
+    def reflect_uniform_light(self, cosine: Float[Tensor, " S"]) -> Float[Tensor, " S"]:
+        """Compute the specular radiance of white samples under uniform light of irradiance 1.
+
+        The cosine is that of the angle between the normal and the direction to the camera.
+        """
+        colored, white = self.lobes(cosine.clamp(0, 1), degree=0)
         total = white if colored is None else white + colored
         return total[0] * _UNIFORM_COEFFICIENT
 
@@ -231,19 +231,17 @@ class SampleGloss(NamedTuple):
         uncoated_factors = lambertian_factors(degree).to(self.roughness)
         return uncoated_factors[:, None] - self.specular_factor * coat_factors[bands(degree)]
 
-    def diffuse_factor(
-        self, normals: Float[Tensor, "S 3"], toward: Float[Tensor, "_ 3"]
-    ) -> Float[Tensor, " S"]:
+    def diffuse_factor(self, cosine: Float[Tensor, " S"]) -> Float[Tensor, " S"]:
         """Compute the factor by which metal and coat reduce the diffuse radiance at S samples.
 
         The diffuse radiance is this factor times the albedo times the irradiance
         below the coat. The factor is (1 - m) (1 - s E(n·v)) / (1 - s E_avg), with
         the metallic fraction m and the specular factor s. E is the fraction of
         light that the coat reflects (`coat_albedo`), and E_avg its mean
-        (`coat_mean`). The result is differentiable with respect to the vectors and
+        (`coat_mean`). The result is differentiable with respect to the cosine n·v and
         the gloss. n is the normal, and v leads to the camera.
         """
-        transmittance = self.coat_transmittance((normals * toward).sum(1))
+        transmittance = self.coat_transmittance(cosine)
         mean_transmittance = 1 - self.specular_factor * lobes.coat_mean(self.roughness)
         return (1 - self.metallic) * transmittance / mean_transmittance
 
@@ -302,9 +300,7 @@ def at_samples(values: Tensor, samples: Tensor | slice) -> Tensor:
     return values if len(values) == 1 else values[samples]
 
 
-def sample_gloss(
-    mesh: Mesh, fragments: Fragments, gloss: Gloss | None = None
-) -> SampleGloss | None:
+def sample_gloss(mesh: Mesh, fragments: Fragments, gloss: Gloss | None) -> SampleGloss | None:
     """Look up the specular material (gloss) at the samples of a view that show the mesh.
 
     The result is differentiable with respect to `gloss`. A warning is issued if

@@ -34,7 +34,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from renderer.light.harmonics import bands, cache_tensors, evaluate_harmonics, rotate
+from renderer.light.harmonics import cache_tensors, evaluate_harmonics, rotate, rows_and_orders
 from renderer.microfacets import DIELECTRIC, distribution, fresnel, masking_denominator
 from renderer.settings import MIN_ROUGHNESS
 from renderer.vectors import Angle, Components, rotate_about_x, rotate_about_y, rotate_about_z, unit
@@ -135,7 +135,7 @@ class ViewFrame(NamedTuple):
         degree = (math.isqrt(8 * len(lobes) + 1) - 3) // 2
         # In sample axes, the coefficients of the orders m ≥ 0 are c_lm s_m cos mφ, and those of
         # the orders -m < 0 are c_lm s_m sin mφ (see the module).
-        functions, orders = (ids.to(lobes.device) for ids in _functions_and_orders(degree))
+        functions, orders = (ids.to(lobes.device) for ids in rows_and_orders(degree))
         # The normal is (sin θ cos φ, sin θ sin φ, cos θ). The smallest sine avoids a division
         # by 0 at θ = 0, where its powers make the factors 0 or 1, and gradients finite.
         x, y, _ = self.normals
@@ -191,15 +191,6 @@ def _sine_exponents(orders: Tensor) -> Tensor:
     return torch.where(orders == 0, 0, 2 - orders % 2)
 
 
-@cache_tensors
-def _functions_and_orders(degree: int) -> tuple[Tensor, Tensor]:
-    """Find the index l (l + 1) / 2 + |m| of c_l|m|, and the order m, for each harmonic."""
-    l = bands(degree)
-    m = torch.arange(len(l)) - l * (l + 1)
-    function_of_harmonic = l * (l + 1) // 2 + m.abs()
-    return function_of_harmonic, m
-
-
 def _complex_powers(x: Tensor, y: Tensor, degree: int) -> Tensor:
     """Compute cos mφ and sin mφ from x = cos φ and y = sin φ, as parts of (x + iy)^m.
 
@@ -216,7 +207,7 @@ def _complex_powers(x: Tensor, y: Tensor, degree: int) -> Tensor:
 def _rotate_harmonics(coefficients: Tensor, angle: Angle) -> Tensor:
     """Rotate SH coefficients u about z by a, x to y: u'_m = cos(ma) u_m - sin(ma) u_-m."""
     degree = math.isqrt(len(coefficients)) - 1
-    _, order = _functions_and_orders(degree)
+    _, order = rows_and_orders(degree)
     order = order.to(coefficients.device)
     # Rows for m from -degree to degree: sin(|m| a) if m < 0, and cos(ma) if m ≥ 0.
     sines_and_cosines = _complex_powers(angle.cosine, angle.sine, degree)
@@ -233,8 +224,7 @@ def _rotate_harmonics(coefficients: Tensor, angle: Angle) -> Tensor:
 
 def _multiply_bands(rotation: Tensor, coefficients: Tensor) -> Tensor:
     """Rotate SH coefficients by a matrix, which has only one block per degree on its diagonal."""
-    degrees = range(math.isqrt(len(coefficients)))
-    slices = [slice(l * l, (l + 1) * (l + 1)) for l in degrees]
+    slices = [slice(l * l, (l + 1) * (l + 1)) for l in range(math.isqrt(len(coefficients)))]
     return torch.cat([rotation[b, b].to(coefficients) @ coefficients[b] for b in slices])
 
 

@@ -123,7 +123,7 @@ def glossy_radiance(
     light = light.to(wide)
     gloss = gloss.to(shading_normals)
     # Albedo of the diffuse layer below the transparent coat, as the camera sees it.
-    diffuse_albedo = albedo * gloss.diffuse_factor(shading_normals, to_camera)[:, None]
+    diffuse_albedo = albedo * gloss.diffuse_factor((shading_normals * to_camera).sum(1))[:, None]
     specular_blocks = []
     size = max(BLOCK_ON_CPU, block_size(light.device) // GLOSSY_FACTOR)
     for first in range(0, len(shading_normals), size):

@@ -31,6 +31,7 @@ of two faces is therefore covered by exactly one of them. NumPy, numba and torch
 the same results. OpenGL rounds depths differently.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
 
@@ -59,12 +60,10 @@ class Rasterizer:
 
     Attributes:
         name: Name of its module in this package.
-        description: Name with the version or the device, for log lines.
         is_automatic: Whether points on a GPU are rasterized there by torch instead.
     """
 
     name: str
-    description: str
     is_automatic: bool = False
 
     def rasterize(
@@ -100,16 +99,13 @@ def choose(rasterizer: str = "auto") -> Rasterizer:
     """
     require_choice("rasterizer", rasterizer, RASTERIZERS)
     if rasterizer == "opengl":
-        return Rasterizer("opengl", f"opengl ({opengl.device()})")
-    if rasterizer in ("numpy", "torch"):
-        return Rasterizer(rasterizer, rasterizer)
-    is_automatic = rasterizer == "auto"
-    try:
-        # Only imported when it is needed, because it also imports numba, which takes 0.5 s.
-        from renderer.visibility import numba
-
-        return Rasterizer("numba", f"numba ({numba.VERSION})", is_automatic)
-    except InputError:
-        if not is_automatic:
-            raise
-    return Rasterizer("numpy", "numpy (numba is faster: pip install numba)", is_automatic)
+        with opengl.open_context():
+            pass  # This draws a test image.
+    if rasterizer != "auto":
+        # numba is only imported when it is needed, which takes 0.5 s. It may be missing.
+        import_module(f"renderer.visibility.{rasterizer}")
+        return Rasterizer(rasterizer)
+    with suppress(InputError):
+        import_module("renderer.visibility.numba")
+        return Rasterizer("numba", is_automatic=True)
+    return Rasterizer("numpy", is_automatic=True)

@@ -25,6 +25,7 @@ from renderer.errors import require_finite
 from renderer.modes import once_differentiable, without_autocast
 from renderer.settings import ImageSettings
 from renderer.visibility import Rasterizer
+from renderer.visibility.numpy import doubled_areas
 
 # Largest number of samples of the views that are shaded at once on a CPU, into whose cache their
 # values should fit. A larger view is shaded alone.
@@ -114,10 +115,8 @@ class Fragments:
         """Homogeneous position (x, y, z, w) of the camera of the only view, or of each sample.
 
         w is 1 for the position of a perspective camera, and 0 for the direction
-        to an orthographic camera. Without a camera, all four numbers are 0.
+        to an orthographic camera.
         """
-        if not self.cameras:
-            return torch.zeros(1, 4)
         eyes = torch.stack([camera.differentiable_eye() for camera in self.cameras])
         if len(eyes) == 1:
             return eyes
@@ -201,10 +200,11 @@ class Fragments:
         y = (2 * (rows - row) - 1) / columns - rows / columns
         return torch.stack([x, y]).T
 
-    def by_sample(self) -> "Fragments":
-        """Return a copy for a finer image, in which each sample is a pixel.
+    def by_sample(self, camera: Camera) -> "Fragments":
+        """Return a copy for a finer image of another camera, in which each sample is a pixel.
 
-        The samples keep their order, and the finer image has one sample per pixel.
+        The samples keep their order, and the finer image has one sample per pixel. The camera
+        differs only in its gradients.
         """
         sample_count = len(self.sample_numbers)
         finer = replace(
@@ -214,6 +214,7 @@ class Fragments:
             pixels=self.sample_numbers,
             coverage=self.coverage.new_ones(sample_count),
             sample_to_pixel=torch.arange(sample_count, device=self.sample_numbers.device),
+            cameras=(camera,),
         )
         # The copy does not compute the weights again.
         vars(finer)["barycentric"] = self.barycentric
@@ -277,8 +278,7 @@ class Fragments:
 
     def to(self, device: torch.device | str) -> "Fragments":
         """Return the fragments with all tensors on a device."""
-        is_there = self.pixels.device == torch.device(device)
-        return self if is_there else on_device(self, device)
+        return self if self.pixels.device == torch.device(device) else on_device(self, device)
 
 
 def on_device(parts: Any, device: torch.device | str) -> Any:
@@ -472,9 +472,8 @@ def _fragments_of_views(
     # Axes: coordinates x and y, corner, seen face.
     outlines = projected.flatten(0, 1).T[:2].index_select(1, projected_corners)
     outlines = outlines.unflatten(1, (3, -1))
-    (ax, bx, cx), (ay, by, cy) = outlines
-    # A face is seen from behind if its corners are clockwise in the image.
-    is_seen_from_behind = (bx - ax) * (cy - ay) < (cx - ax) * (by - ay)
+    # A face is seen from behind if its corners are clockwise in the image, in which y points up.
+    is_seen_from_behind = doubled_areas(outlines) < 0
     return Fragments(
         shape=settings.shape,
         samples=settings.samples,

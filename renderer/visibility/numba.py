@@ -12,7 +12,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 
@@ -22,7 +24,6 @@ from renderer.visibility.numpy import FAR, SUBSAMPLE_BITS, FaceIds, Faces, Views
 
 # numba also raises ImportError for an unsupported NumPy.
 numba = import_package("numba", "numba, or choose the rasterizer numpy")
-VERSION = numba.__version__
 # Types of the arguments and of the result of `_draw`, for which numba compiles it: positions (2, V)
 # and depths (V,) of the vertices, faces (F, 3), and the index of the nearest face and its depth at
 # each sample.
@@ -53,7 +54,12 @@ _njit: Callable[..., Any] = partial(numba.njit, nogil=True, error_model="numpy")
 
 
 def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a function for TYPES, and store the code in a file for the next process."""
+    """Compile a function for TYPES, and store the code in a file for the next process.
+
+    numba compiles anew if this file or the name of the function changes. The name gets a sum of
+    the file of the functions that are compiled in.
+    """
+    function.__qualname__ += f"_{crc32(Path(exact.__file__).read_bytes())}"
     # numba may raise any exception if its cache is read-only or damaged.
     try:
         return _njit(TYPES, cache=True)(function)
@@ -61,8 +67,6 @@ def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         return _njit(TYPES)(function)
 
 
-# numba compiles anew only if this file changes. After a change of these functions in the other
-# file, delete __pycache__.
 _doubled_area = _njit(exact.doubled_areas)
 _next_sample = _njit(exact.next_sample)
 _depth_plane = _njit(exact.depth_planes)

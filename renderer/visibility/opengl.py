@@ -66,18 +66,12 @@ def rasterize(points: Views, faces: Faces, shape: tuple[int, int], closed: bool)
         ordered = np.take_along_axis(faces, (lowest + np.arange(3)) % 3, axis=1)
     else:
         ordered = np.sort(faces, axis=1)
-    with _context() as context:
+    with open_context() as context:
         return _draw(context, points, ordered, shape, closed)
 
 
-def device() -> str:
-    """Return the name of the device on which OpenGL draws."""
-    with _context() as context:
-        return context.info["GL_RENDERER"]
-
-
 @contextmanager
-def _context() -> Iterator[moderngl.Context]:
+def open_context() -> Iterator[moderngl.Context]:
     """Yield an OpenGL context; without EGL, or if it draws wrong, `InputError` is raised."""
     # Triton must be loaded before the driver, because a process that loads Triton second
     # crashes.

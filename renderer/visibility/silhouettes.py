@@ -137,8 +137,7 @@ class _ZerosWithGradient(torch.autograd.Function):
         """Create the zeros, and store the view and the homogeneous positions (x w, y w, w)."""
         ctx.save_for_backward(positions)
         ctx.view = view
-        pixel_count = len(view.fragments.pixels) + len(view.uncovered_pixels)
-        return view.radiance.new_zeros(3, pixel_count)
+        return view.radiance.new_zeros(3, len(view.fragments.pixels) + len(view.uncovered_pixels))
 
     @staticmethod
     @once_differentiable
@@ -190,9 +189,8 @@ class _MovingView:
         # Radiance times upstream gradient, summed over the color channels.
         weighted_radiance = (self.radiance * upstream_at_samples).sum(0)
         weighted_image = fragments.image_of_samples(weighted_radiance, torch.nan)
-        right, down = (
-            self._gradient_along(axis, weighted_image, upstream_at_samples) for axis in (X, Y)
-        )
+        right = self._gradient_along(X, weighted_image, upstream_at_samples)
+        down = self._gradient_along(Y, weighted_image, upstream_at_samples)
         # Most samples have neighbors of the same color. Their gradient is 0.
         samples = torch.nonzero((right != 0) | (down != 0)).squeeze(1)
         # Gradient with respect to the image position (x, y) of each selected sample. The
@@ -276,14 +274,12 @@ class _MovingView:
         # sample and the pixel of the second sample each gain half of the difference of the two
         # radiances. The factor 1/2 is already in `upstream`.
         toward_second = self.radiance.new_zeros(len(along))
+        is_covered, of_mesh = crossings.samples >= 0, self.radiance[:, crossings.samples]
         for pixels in _pixels_of_cells(crossings.cells, self.fragments):
             # Radiance at both samples, or the background if a sample shows no mesh.
-            first_radiance, second_radiance = (
-                torch.where(samples >= 0, self.radiance[:, samples], self.background[:, pixels])
-                for samples in crossings.samples
-            )
+            radiance = torch.where(is_covered, of_mesh, self.background[:, None, pixels])
             pixel_gradient = upstream[:, column_of_pixel[pixels]]
-            toward_second += (pixel_gradient * (first_radiance - second_radiance)).sum(0)
+            toward_second += (pixel_gradient * (radiance[:, 0] - radiance[:, 1])).sum(0)
         # Gradient with respect to the position (x, y) of each crossing in the image.
         crossing_gradients = (toward_second * along * crossings.normal).T
         # Distances by which a crossing moves if the first, or the second, end of its edge
@@ -440,8 +436,7 @@ def _cut_edges(
     # crosses. The index of an edge is repeated for all lines that it crosses.
     edge = torch.repeat_interleave(cuts_per_edge)
     cuts_before_edge = cuts_per_edge.cumsum(0) - cuts_per_edge
-    cut = torch.arange(len(edge), device=edge.device)
-    line = cut - (cuts_before_edge - first_line)[edge]
+    line = torch.arange(len(edge), device=edge.device) - (cuts_before_edge - first_line)[edge]
     # Position of the crossing on the edge, from 0 at the start of the edge to 1 at its end.
     fraction = (line - start[0, edge]) / (end[0] - start[0])[edge]
     position = start[1, edge] + fraction * (end[1] - start[1])[edge]

@@ -33,8 +33,7 @@ def rasterize(
     step = max(1, FACES_PER_TILE // max(1, len(faces)))
     for some_keys, some_points in zip(keys.split(step), points.split(step), strict=True):
         for first in range(0, len(faces), FACES_PER_TILE):
-            some_faces = faces[first : first + FACES_PER_TILE]
-            _draw(some_keys, some_points, some_faces, first, closed)
+            _draw(some_keys, some_points, faces[first : first + FACES_PER_TILE], first, closed)
     # The conversion keeps the low 32 bits of each key, the face index.
     return keys.int()
 

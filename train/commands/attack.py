@@ -95,7 +95,8 @@ def run(settings: AttackExperimentSettings) -> None:
         require_renderers(settings.attack.renderers)
         if adversary is None:
             settings.attack.require_parameters()
-    classifier = load_chosen(settings).to(choose_device(settings.device))
+    device = choose_device(settings.device)
+    classifier = load_chosen(settings).to(device)
     if adversary is not None:
         rasterizer = choose_rasterizer(settings.renderer)
         views = format_reloaded(adversary, rasterizer, classifier, settings.attack)

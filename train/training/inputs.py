@@ -31,7 +31,7 @@ from train.data import sets
 from train.data.photographs import find_photographs, load_photographs
 from train.data.rendered_shapes import cache_folder, load_shapes
 from train.device import choose_rasterizer, main_process_first
-from train.networks import CLASSIFIER, describe
+from train.networks import CLASSIFIER, DETECTOR, describe
 from train.settings import MIN_SIZE, OTHER, UNLABELED, ExperimentSettings, published_folder
 
 # Default fraction of the training images that validate the network.
@@ -111,11 +111,14 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
         return None
     if name.startswith(SWITCHES):
         raise InputError(f"network={name} has two networks: train one of them", "network")
-    # A classifier comes from a library or a file, and a file of weights alone is refused like it.
-    # Any other name is the folder of a training run.
-    if checkpoints.is_classifier(name) or checkpoints.lacks_architecture(Path(name)):
+    # A classifier comes from a library or a file. Any other name is the folder of a training run.
+    if checkpoints.is_classifier(name):
         return _load_classifier(settings, name)
     source = Path(name.removeprefix(checkpoints.RUN))
+    # A file of weights alone does not say which network they belong to.
+    if checkpoints.lacks_architecture(source):
+        advice = f"give both, as in network=torchvision:resnet50 weights={source}"
+        raise InputError(f"network={name} has weights, but no architecture: {advice}", "network")
     if settings.weights is not None:
         raise InputError(f"weights: network={name} has its own: leave weights out", "weights")
     # The network of a run has its own classes and its own normalization.
@@ -124,6 +127,9 @@ def load_initial(settings: ExperimentSettings) -> Initial | None:
     with keyed(run="network"):
         path, state = checkpoints.load_selected(source)
     architecture = state["architecture"]
+    if architecture.get("name") == DETECTOR:
+        fault = f"network={name} is no classifier, but for detection"
+        raise InputError(f"{fault}: train it by nb.harden in Python", "network")
     # A run of a network that a Python function built names this function. To call it means to run
     # code, which the user must allow.
     built_by = str(architecture.get("name"))

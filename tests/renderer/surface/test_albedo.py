@@ -213,7 +213,7 @@ def test_a_gloss_texture_that_is_larger_keeps_its_texels(side):
     mesh = replace(poster(texture), gloss=np.ones((2, 3), np.float32), gloss_textures=(gloss,))
     painted, _ = with_added_albedo(mesh, np.zeros((2, 3)), "srgb")
     fragments = view(mesh, 8)
-    before, after = (sample_gloss(one, fragments) for one in (mesh, painted))
+    before, after = (sample_gloss(one, fragments, None) for one in (mesh, painted))
     torch.testing.assert_close(after.roughness, before.roughness, rtol=0, atol=0.03 * (side > 1))
 
 

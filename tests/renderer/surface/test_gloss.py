@@ -227,7 +227,7 @@ def test_white_surfaces_reflect_no_more_than_an_even_sky_and_dielectrics_all_of_
     views = torch.stack([-((1 - cosine**2).sqrt()), 0 * cosine, cosine], dim=1)
     normals = UP.expand_as(views)
     colored, white, _ = gloss.specular_transfer(normals, views, 0)
-    diffuse = gloss.diffuse_factor(normals, views) * gloss.factors_below_coat(0)[0] / math.pi
+    diffuse = gloss.diffuse_factor(cosine) * gloss.factors_below_coat(0)[0] / math.pi
     specular = (colored + white)[0] * math.sqrt(4 * math.pi) / math.pi
     reflected = diffuse + specular
     assert diffuse.min() >= 0
