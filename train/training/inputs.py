@@ -230,7 +230,8 @@ def choose_validation(
     # was trained on rendered images records the entry "data".
     record = {"fraction": asked or default, "seed": 0, "images": data.train.content_hash}
     record |= {"data": "shapes"} if data.rendered else {}
-    earlier: Any = (initial.architecture.get("validation") if initial else None) or {}
+    stored = initial.architecture.get("validation") if initial else None
+    earlier: Any = stored if isinstance(stored, dict) else {}
     left_out = earlier.get("fraction")
     if initial is None or (data.rendered and earlier and "data" not in earlier):
         return asked or default, record

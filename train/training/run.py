@@ -20,7 +20,6 @@ from renderer.errors import InputError, keyed, keys_of
 from renderer.image import to_unit
 from renderer.io.files import remove
 from train import checkpoints, console
-from train.cli import read_settings
 from train.data import photographs
 from train.data.sets import DataSet, Split, channel_statistics, held_out_rows
 from train.device import MixedPrecision, place
@@ -30,22 +29,9 @@ from train.results.metrics import METRICS
 from train.results.overwrite import remove_run
 from train.results.predictions import SUMMARY
 from train.results.scoring import Model, Predictor, evaluate_photographs, format_scores
-from train.run_config import (
-    CONFIG,
-    read_config,
-    require_same_run,
-    require_same_weights,
-    write_config,
-)
+from train.run_config import CONFIG, require_same_run, require_same_weights, write_config
 from train.run_folder import BEFORE, BEST, WEIGHTS
-from train.settings import (
-    KEPT_ASIDE,
-    LABORATORY,
-    PHOTOGRAPHS_FIRST,
-    WIDERESNET,
-    ExperimentSettings,
-    in_light,
-)
+from train.settings import KEPT_ASIDE, LABORATORY, WIDERESNET, ExperimentSettings, in_light
 from train.training import inputs
 from train.training.averages import INTERPOLATION, interpolate, predict
 from train.training.loop import Trainer, evaluate
@@ -70,6 +56,7 @@ class Run:
     Attributes:
         data: Data set. Its labels become indices into the classes of the network.
         scored_folders: Folders of photographs or renders on which the networks are scored, by name.
+        original: Network before a first training on photographs, which made `initial`.
         held_out: Whether each training image validates the network.
     """
 
@@ -78,6 +65,7 @@ class Run:
     initial: inputs.Initial | None
     folder: Path
     command: str = ""
+    original: inputs.Initial | None = None
 
     def __post_init__(self) -> None:
         """Check all inputs and build the network. If the run is resumed, restore its checkpoint."""
@@ -124,7 +112,12 @@ class Run:
             self.trainer = self._build_trainer(record, threads)
             if settings.train.recognize:
                 recognizing_layers(self.trainer.model.network, self.data.size)
-        self.before = self._network_before()
+        # Network that the scores call the one before the training.
+        self.before = self.trainer.initial
+        if self.before and self.original:
+            self.before = deepcopy(self.before)
+            network = exposure.without_normalized_light(self.before.network)
+            self.original.copy_to(network, self.trainer.architecture)
         # Number of CPU threads with which the run trains.
         self._threads = torch.get_num_threads()
         if self._is_resumed:
@@ -187,21 +180,6 @@ class Run:
         service = inputs.build_service(settings, data, device, task)
         options = description, service, self.folder, data.labeled, initial is not None
         return Trainer(recipe, model, *options)
-
-    def _network_before(self) -> MixedPrecision | None:
-        """Return the initial network, or the one before a first training on photographs."""
-        before = self.trainer.initial
-        first = Path(str(self.settings.network))
-        own = [of / PHOTOGRAPHS_FIRST for of in (self.folder, self.folder.parent)]
-        if before is None or first not in own:
-            return before
-        # The file has facts beside the settings.
-        recorded = OmegaConf.masked_copy(read_config(first / CONFIG), [*vars(self.settings)])
-        original = inputs.load_initial(read_settings(ExperimentSettings, recorded))
-        before = deepcopy(before)
-        network = exposure.without_normalized_light(before.network)
-        cast(inputs.Initial, original).copy_to(network, self.trainer.architecture)
-        return before
 
     def _build_network(self, shape: dict[str, Any]) -> nn.Module:
         """Build the network without its trained weights, or copy the one that the caller gave."""

@@ -96,7 +96,7 @@ def test_a_scene_in_which_the_mesh_is_recognized_is_searched_for():
 
 
 def test_a_rasterizer_that_does_not_start_is_an_error_of_its_key(monkeypatch, tiny, tmp_path):
-    monkeypatch.setattr(opengl, "device", Mock(side_effect=InputError("no EGL device")))
+    monkeypatch.setattr(opengl, "open_context", Mock(side_effect=InputError("no EGL device")))
     with pytest.raises(InputError, match=r"^renderer\.rasterizer: no EGL device$"):
         attacked("renderer.rasterizer=opengl")
     with pytest.raises(InputError, match=r"^renderer\.rasterizer: no EGL device$"):
