@@ -360,12 +360,12 @@ DARKEST = 1e-6
 def as_photographs(name: str, given: Tensor | np.ndarray) -> UInt8[Tensor, "N 3 H W"]:
     """Check that a value has photographs of 8 bits, and return them as a tensor."""
     require_kind(name, given, Tensor | np.ndarray, "a tensor or an array of photographs, uint8")
-    photographs = given if isinstance(given, Tensor) else torch.from_numpy(given)
-    shape = tuple(photographs.shape)
-    if photographs.dtype != torch.uint8 or len(shape) != 4 or shape[1] != 3 or not all(shape):
-        fault = f"{name} is {str(photographs.dtype).removeprefix('torch.')} of shape {shape}"
+    shape, dtype = tuple(given.shape), str(given.dtype).removeprefix("torch.")
+    if dtype != "uint8" or len(shape) != 4 or shape[1] != 3 or not all(shape):
+        fault = f"{name} is {dtype} of shape {shape}"
         raise InputError(f"{fault}: give uint8 of shape (N, 3, height, width)")
-    return photographs
+    # torch takes only arrays that may be written to and have no negative strides.
+    return given if isinstance(given, Tensor) else torch.from_numpy(np.array(given))
 
 
 class ProjectedLight(NamedTuple):

@@ -1,5 +1,6 @@
 """Fine-tuning a classifier that this project did not train keeps the names of its weights."""
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -136,8 +137,15 @@ def test_labeled_folders_are_scored_in_a_networks_classes_before_and_after(
         ("network=torchvision:resnet18", r"weights=.*torchvision:resnet18 "),
         ("model.name=torchvision:resnet18", "^model.name=torchvision:resnet18"),
         ("train.distillation_weight=0", "set network and train.distillation_weight"),
+        ("network=pretrained/detector weights=null", "for detection: train it by nb.harden"),
     ],
 )
 def test_settings_that_do_not_fit_the_network_are_refused(tuned, change, message):
     with pytest.raises(InputError, match=message):
-        tuned("unlabeled", "augment=random", change)
+        tuned("unlabeled", "augment=random", *change.split())
+
+
+def test_weights_without_their_network_are_refused_with_the_remedy(tuned, weights, tmp_path):
+    alone = shutil.copy(weights, tmp_path / "weights.bin")
+    with pytest.raises(InputError, match=r"no architecture: give both, as in .* weights=.*\.bin"):
+        tuned("unlabeled", f"network={alone}", "weights=null")
