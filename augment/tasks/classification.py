@@ -111,7 +111,7 @@ class _LogitReader:
         has_row_per_image = is_tensor and logits.ndim == 2 and len(logits) == len(images)
         if not has_row_per_image or self.class_count not in (None, logits.shape[1]):
             returned = tuple(logits.shape) if is_tensor else type(logits).__name__
-            remedy = f"it must return logits {(len(images), self.class_count or 'C')}"
+            remedy = f"it must return logits {(len(images), self.class_count or 'C')}, or set task"
             shape = tuple(images.shape)
             raise InputError(f"{self.title} returned {returned} for images {shape}: {remedy}")
         if logits.shape[1] < 2:
