@@ -172,8 +172,7 @@ def publish(
     points: list[OperatingPoint] = []
     # A Python function of the user may build the network. It is called only if the
     # network must be calibrated.
-    is_python = str(state["architecture"].get("name")).startswith(PYTHON)
-    if calibrate is not None or not is_python:
+    if calibrate is not None or not str(state["architecture"].get("name")).startswith(PYTHON):
         # `load_run` raises an InputError if nobody could load the published network.
         loaded = load_run(path, model=network, trust_code=trust_code)
         if calibrate is not None and false_positive_rate is not None:
