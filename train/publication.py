@@ -76,9 +76,8 @@ def load(name: str) -> PublishedNetwork | PublishedDetector:
     require_choice("name", name, sorted(path.parent.name for path in files))
     folder = published_folder(PRETRAINED / name)
     loaded = load_run(folder)
-    _, state = load_selected(folder)
     # The scores of a classifier are metrics by name, those of a detector are in groups of images.
-    scores = state["scores"]
+    scores = load_selected(folder)[1]["scores"]
     facts = loaded.network, loaded.size, loaded.classes, name
     network: PublishedNetwork | PublishedDetector
     if isinstance(loaded, Classifier):
