@@ -59,8 +59,7 @@ def run_name(overrides: Sequence[str], fixed: Collection[str] = (), parent: str 
     # Settings of Hydra itself, such as hydra.job, and CIRCUMSTANCES do not change the result.
     words = [word.partition("=") for word in overrides if not HYDRAS_OWN.match(word)]
     pairs = sorted((key, value) for key, _, value in words if key not in CIRCUMSTANCES)
-    digest = hashlib.sha256(repr(pairs).encode(errors="surrogatepass")).hexdigest()
-    ending = f"@{digest[:8]}"
+    ending = "@" + hashlib.sha256(repr(pairs).encode(errors="surrogatepass")).hexdigest()[:8]
     # The folder of an earlier run with these settings, from which training can continue.
     for known in Path(parent).glob(f"*{ending}") if parent else ():
         return known.name

@@ -439,9 +439,8 @@ class RenderSettings(TaskSettings):
     @property
     def split_counts(self) -> dict[str, int]:
         """Number of renders in each part that has one. Together they have `count` renders."""
-        ends = accumulate(self.splits.values())
         total = sum(self.splits.values())
-        limits = [0, *(round(self.count * end / total) for end in ends)]
+        limits = [0, *(round(self.count * end / total) for end in accumulate(self.splits.values()))]
         counts = zip(self.splits, map(int.__sub__, limits[1:], limits), strict=True)
         return {part: count for part, count in counts if count}
 

@@ -78,8 +78,7 @@ class WideResNet(nn.Module):
         self.groups = nn.Sequential()
         inputs = 16
         # The first group keeps the resolution, and each other group halves it.
-        for outputs in (16 * width, 32 * width, 64 * width):
-            stride = 1 if outputs == 16 * width else 2
+        for outputs, stride in ((16 * width, 1), (32 * width, 2), (64 * width, 2)):
             blocks = [_Block(inputs, outputs, stride, dropout)]
             # A network of depth 6n + 4 has n blocks in each group.
             blocks += [_Block(outputs, outputs, 1, dropout) for _ in range((depth - 4) // 6 - 1)]
@@ -142,8 +141,7 @@ class Dropout(nn.Dropout):
         if not self.training or self.p == 0:
             return x
         draws = torch.rand(distributed.world_size(), *x.shape, device=x.device)
-        is_kept = draws[distributed.rank()] >= self.p
-        return x * is_kept / (1 - self.p)
+        return x * (draws[distributed.rank()] >= self.p) / (1 - self.p)
 
 
 def build_network(
@@ -164,8 +162,7 @@ def build_network(
     normalizes images itself. `shape` is for "wideresnet".
     """
     if classifier:
-        normalization = None if mean is None or std is None else (mean, std)
-        facts = NetworkFacts(classes, size, normalization)
+        facts = NetworkFacts(classes, size, None if mean is None or std is None else (mean, std))
         built = load_source(name, None, facts, trust_code, is_random=True)
         return built.network.requires_grad_(True)
     if name == DETECTOR:

@@ -160,8 +160,7 @@ def program(name: str, as_called: bool = False) -> list[str]:
     # The module has a file of its own in scripts/, except pnb-train, which is `python -m train`.
     words = ["-m", "train" if name == "train" else f"scripts.{name}"]
     if is_installed:
-        has_path = as_called and called.stem == installed_name
-        words = [str(called) if has_path else installed_name]
+        words = [str(called) if as_called and called.stem == installed_name else installed_name]
     if process_count == 1:
         return words if is_installed else [python, *words]
     torchrun = [python, "-m", "torch.distributed.run"] if as_called else ["torchrun"]

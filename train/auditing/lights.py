@@ -227,8 +227,7 @@ def plain_images(views: Views, size: Size) -> Float[Tensor, "E 3 H W"]:
 def criterion_of(network: TaskNetwork, scene: Scene, label: int) -> Criterion:
     """Return the criterion of an attack on a scene, all of whose views show the same class."""
     source = torch.full((len(scene), scene.views), label, device=scene.lights.device)
-    truth = partial(scene.truth, network.label)
-    return network.task.criterion(source, truth, len(network.classes))
+    return network.task.criterion(source, partial(scene.truth, network.label), len(network.classes))
 
 
 def is_found(
@@ -363,8 +362,7 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
         ball = light_sphere(conditions.light[index], BALL_SIDE, basis=basis)
         shown = [round(value, 4) for value in probabilities[index, shown_classes].tolist()]
         image = _encode_jpeg(result.drawn(images[index, 0]), SIDE)
-        ball_image = _encode_jpeg(ball, BALL_SIDE)
-        frame = {"image": image, "ball": ball_image, "probabilities": shown}
+        frame = {"image": image, "ball": _encode_jpeg(ball, BALL_SIDE), "probabilities": shown}
         frames.append(frame | {"predicted": predictions[index]})
     names = [classes[index] for index in shown_classes]
     return {"classes": names, "label": names[0], "frames": frames}
@@ -512,5 +510,4 @@ def _curve(matches: Matches) -> list[tuple[float, ...]]:
 def score_photographs(network: TaskNetwork, annotations: Annotations, out: Path) -> None:
     """Score a detector on photographs with boxes. Unreadable ones are left out."""
     how = annotated_scores.Showing(LETTERBOX, skip_unreadable=True, device=device_of(network))
-    scores = annotated_scores.evaluate_detector(network, annotations, None, how)
-    annotated_scores.write(scores, out)
+    annotated_scores.write(annotated_scores.evaluate_detector(network, annotations, None, how), out)

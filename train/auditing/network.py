@@ -434,5 +434,4 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
         rows.append([name, value, tables.format_interval(gains.get(name), "+")])
     intervals = tables.describe_intervals(gains.values())
     table = Table(intervals, ["network", title, "gain over the original network"], rows)
-    remedy = None if gain is None else chosen
-    return Recommendation(remedy, f"{ADVICE[chosen]} {reason}", table)
+    return Recommendation(None if gain is None else chosen, f"{ADVICE[chosen]} {reason}", table)

@@ -344,9 +344,8 @@ def _worst(networks: Networks, folders: Mapping[str, Path]) -> dict[str, list[Pi
 def _draw(predictions: Predictions, row: int, folder: Path) -> Picture:
     """Draw an image of a folder over its class, its source and what a network predicts."""
     photograph = predictions.photograph[row]
-    text = first_screen.describe_prediction(predictions, row).text
     subject = ", ".join(map(in_words, filter(None, (photograph.label, photograph.source))))
-    caption = f"{subject}: {text}"
+    caption = f"{subject}: {first_screen.describe_prediction(predictions, row).text}"
     return read_square(folder / photograph.path, SIDE, caption, caption)
 
 
@@ -357,8 +356,7 @@ def detection_sections(networks: Mapping[str, Path], label: str) -> list[dict[st
         if not (folder / lights.DETECTED).exists():
             continue
         content = read_json(folder / lights.DETECTED)
-        title = "renders; 95% intervals over views"
-        tables = [_metrics_table(content["metrics"], title, "light")]
+        tables = [_metrics_table(content["metrics"], "renders; 95% intervals over views", "light")]
         # The same network with the remedy "normalized light", which may have scores, too.
         normalized = folder.with_name(f"{folder.name}{NORMALIZED}")
         for path, end in ((folder, ""), (normalized, ", with normalized light")):

@@ -241,9 +241,8 @@ def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]
         slide = int(changed_in_strongest[photograph].int().argmax())
         shown = [(relighting.UNCHANGED, 0), *((light, slide) for light in result.changed)]
         images = [_drawn(result, result.image(photograph, *item)) for item in shown]
-        side_by_side = torch.cat(images, dim=2)
         names[photograph] = f"relit_{photograph:04d}.png"
-        write_image(out / names[photograph], side_by_side)
+        write_image(out / names[photograph], torch.cat(images, dim=2))
     return names
 
 

@@ -175,14 +175,12 @@ def _write_attack(
     details = []
     # The search chose another scene than the given one, in which the network was wrong already.
     if scene != settings.scene:
-        before = vars(settings.scene)
-        changed = [item for item in vars(scene).items() if item[1] != before[item[0]]]
+        changed = [item for item in vars(scene).items() if item not in vars(settings.scene).items()]
         changes = shlex.join(f"scene.{key}={value}" for key, value in changed)
         details.append(f"{name} is misclassified in the given scene, but not with {changes}")
     # With None, only attacks that use gradients are checked.
-    has_checks = settings.attack.checks
-    if has_checks is None:
-        has_checks = result.settings.uses_gradients
+    wanted = settings.attack.checks
+    has_checks = result.settings.uses_gradients if wanted is None else wanted
     checks = check(result) if has_checks else None
     lines = save(result, folder, checks, settings.attack.renderers)
     heading, *more_lines = format_attack(name, result, checks, lines)
@@ -382,8 +380,7 @@ def _success(result: AttackResult) -> str:
         return f"none of {len(clean)} examples was correct before: there is nothing to count"
     text = f"success on {format_fraction(rate)} examples"
     if result.settings.sensor_noise:
-        without_noise = int(result.success_without_noise[clean].sum())
-        text += f" with a sensor's noise, {without_noise} without"
+        text += f" with a sensor's noise, {int(result.success_without_noise[clean].sum())} without"
     margin = result.settings.margin
     if margin:
         text += f", {int(result.success_with_margin[clean].sum())} with the margin of {margin:g}"
@@ -481,8 +478,7 @@ def write_sweeps(sweeps: Mapping[str, Sweep], norms: Mapping[str, str], out: Pat
     cells = [[*records[0]], *([*record.values()] for record in records)]
     write_csv(out / SWEEP_TABLE, cells, line_end="\r\n")
     # The last mesh is "all" if there are several.
-    last_mesh = records[-1]["mesh"]
-    shown = [record for record in records if record["mesh"] == last_mesh and record["n"]]
+    shown = [record for record in records if record["mesh"] == records[-1]["mesh"] and record["n"]]
     _draw_sweep(shown, norms, out / SWEEP_FIGURE)
 
 

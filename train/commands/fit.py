@@ -63,10 +63,9 @@ def run(settings: FitSettings) -> None:
     else:
         mask = grab_cut(image, settings.box)
     mesh_settings = ObjectSettings(settings.mesh, label="", albedo_scale=settings.albedo_scale)
-    mesh = load_object(mesh_settings).mesh
     names = ("fov", "albedo_scale", "encoding", "bounces")
     options = {name: getattr(settings, name) for name in names}
-    fitted = fit_photograph(image, mask, mesh, settings.size, **options)
+    fitted = fit_photograph(image, mask, load_object(mesh_settings).mesh, settings.size, **options)
     out.mkdir(parents=True, exist_ok=True)
     # The window is the square of the photograph that the found camera shows.
     background = fitted.window.cut(image, BACKGROUND_SIZE, settings.encoding)

@@ -319,8 +319,7 @@ def _light_sources(shot: Shot) -> list[dict[str, Any]]:
         pose = look_at(position, shot.center)
         lights.append(projector(pose, fov, {"bitmap": pattern}, power / len(shot.patterns)))
     # Light from all directions, as from the walls of a room.
-    ambient = {"type": "rgb", "value": shot.ambient.tolist()}
-    lights.append({"type": "constant", "radiance": ambient})
+    lights.append({"type": "constant", "radiance": {"type": "rgb", "value": shot.ambient.tolist()}})
     return lights
 
 
@@ -368,8 +367,7 @@ def write_laboratory(settings: LabSettings) -> int:
     out = writable_folder(settings.out, "out")
     meshes = progress(settings.meshes, "meshes")
     subjects = [read_subject(item, index) for index, item in enumerate(meshes)]
-    paths = [Path(path) for path in settings.environments]
-    environments = {path.stem: _read_environment(path) for path in paths}
+    environments = {path.stem: _read_environment(path) for path in map(Path, settings.environments)}
     groups = _group_subjects(subjects, label_names(settings.label))
     # Pictures that a projector can show: linear RGB, shape (LAB_RESOLUTION, LAB_RESOLUTION, 3).
     pictures = [decode(read_image(path, LAB_RESOLUTION), "srgb") for path in settings.slides]
@@ -394,9 +392,8 @@ def write_laboratory(settings: LabSettings) -> int:
                 places, turns = rng.permutation(count), rng.permutation(count)
                 subject = group[(places[place] + turns[turn % count]) % count]
                 path = _write_render(settings, subject, shot, number)
-                brightness = f"{shot.brightness:.4f}"
                 # A row of photos.csv. Images of one shot have its number.
-                rows.append((path, shot.lighting, number, subject.mesh, brightness))
+                rows.append((path, shot.lighting, number, subject.mesh, f"{shot.brightness:.4f}"))
         write_csv(out / TABLE, [COLUMNS, *sorted(rows)], line_end="\r\n")
         versions = {"python": platform.python_version()}
         versions |= {name: version(name) for name in PACKAGES}
@@ -439,11 +436,10 @@ def _write_render(settings: LabSettings, subject: Subject, shot: Shot, number: i
     seed = stream_seed(settings.seed, "samples", number) % SEED_COUNT
     radiance = path_traced(subject.parts, shot, settings.size, settings.spp, settings.bounces, seed)
     exposed = torch.from_numpy(settings.exposure * radiance).clamp(0, 1)
-    pixels = encode(exposed, "srgb").permute(2, 0, 1)
     path = Path(subject.label) / f"{number:04d}_{shot.lighting}.png"
     file = Path(settings.out, path)
     file.parent.mkdir(parents=True, exist_ok=True)
-    write_image(file, pixels)
+    write_image(file, encode(exposed, "srgb").permute(2, 0, 1))
     return path.as_posix()
 
 
@@ -458,9 +454,8 @@ def _read_environment(path: Path) -> Float[np.ndarray, "H W 3"]:
         light = HARMONICS.project_nonnegative(load_light(str(path)))
         return to_map(light, BUILT_IN_MAP_HEIGHT).clamp(min=0).numpy()
     radiance = read_panorama(path).numpy()
-    upper_half = radiance[: len(radiance) // 2]
     # `not ... > 0` is also true for NaN, which `... <= 0` is not.
-    if not upper_half.max() > 0:
+    if not radiance[: len(radiance) // 2].max() > 0:
         raise InputError(f"environments: {path} has no light above the horizon: give another")
     return radiance
 

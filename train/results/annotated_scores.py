@@ -125,8 +125,7 @@ class DetectionScores(AnnotatedScores):
                 # With a single class, its row would repeat that of all classes.
                 if name != ALL or len(self.labels) > 1:
                     estimates = (metrics.recall, metrics.ap50, metrics.false_per_image)
-                    title = f"{source}: {name}" if source else name
-                    cells.append([title, metrics.n, *estimates])
+                    cells.append([f"{source}: {name}" if source else name, metrics.n, *estimates])
         threshold, iou = self.task.threshold, self.task.iou
         recall, false_count = f"recall at {threshold:g}", f"false per image at {threshold:g}"
         header = ["", "objects", recall, "AP50", false_count]
@@ -163,8 +162,7 @@ class SegmentationScores(AnnotatedScores):
     def table(self) -> Table:
         """Make a table of the mean IoU and that of each class."""
         of_classes = [(name, f"{iou:.3f}") for name, iou in self.by_class.items()]
-        rows = [("mean", self.miou), *of_classes]
-        return tables.table_of("", ["class", "IoU"], rows)
+        return tables.table_of("", ["class", "IoU"], [("mean", self.miou), *of_classes])
 
     def to_summary(self) -> dict[str, Any]:
         """Convert the scores to the content of summary.json."""
@@ -313,8 +311,6 @@ def evaluate_segmenter(network: TaskNetwork, folder: Path, how: Showing) -> Segm
         fault = f"the masks of {folder} have only the values {sorted(seen)}, and 255 does not count"
         raise InputError(f"{fault}: write 1 for the object, or the index of its class", "photos")
     named = zip(network.classes, by_class, strict=True)
-    # The IoU of a class that no pixel has is NaN.
-    known = {name: iou for name, iou in named if np.isfinite(iou)}
     return SegmentationScores(
         size=height_and_width(network.size),
         fit=how.fit,
@@ -323,7 +319,8 @@ def evaluate_segmenter(network: TaskNetwork, folder: Path, how: Showing) -> Segm
         contents=f" ({len(missing)} others have no mask)" if missing else "",
         pictures=pictures,
         miou=miou,
-        by_class=known,
+        # The IoU of a class that no pixel has is NaN.
+        by_class={name: iou for name, iou in named if np.isfinite(iou)},
     )
 
 

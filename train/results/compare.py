@@ -196,8 +196,7 @@ def difference(
     if name in TOP_RANKS:
         # The accuracies of networks with different classes can be of different images.
         pools = [pool for item in (*evaluations, *reference) if (pool := item.find(subset))]
-        shown = {tuple(item.path for item in pool.classified.photograph) for pool in pools}
-        if len(shown) > 1:
+        if len({tuple(item.path for item in pool.classified.photograph) for pool in pools}) > 1:
             return None
     after = _jackknives(evaluations, subset, name)
     before = _jackknives(reference, subset, name)

@@ -238,12 +238,9 @@ def _groups(matches: Matches) -> list[np.ndarray]:
     Images of each group are left out by themselves. A rare class then has an interval over the few
     images that show it. With fewer than two images without objects, all images are one group.
     """
-    has_object = np.zeros(matches.image_count, bool)
-    has_object[matches.objects.image] = True
-    others = np.flatnonzero(~has_object)
-    if len(others) < 2:
-        return [np.arange(matches.image_count)]
-    return [np.flatnonzero(has_object), others]
+    images = np.arange(matches.image_count)
+    others = np.setdiff1d(images, matches.objects.image)
+    return [images] if len(others) < 2 else [np.unique(matches.objects.image), others]
 
 
 def estimate(

@@ -318,9 +318,8 @@ def _draw_images(before: Predictions, after: Predictions, images: Path) -> list[
         photograph = before.photograph[row]
         # One image of each class and source comes first, so that the images differ.
         first_of_group.setdefault((photograph.label, photograph.source), row)
-    chosen = dict.fromkeys([*first_of_group.values(), *ordered])
     drawn = []
-    for row in [*chosen][:PICTURES]:
+    for row in [*dict.fromkeys([*first_of_group.values(), *ordered])][:PICTURES]:
         photograph = before.photograph[row]
         subject = ", ".join(map(in_words, filter(None, (photograph.label, photograph.source))))
         original, hardened = (describe_prediction(item, row) for item in (before, after))

@@ -97,8 +97,7 @@ class Jackknife:
         half_width = quantile * variance**0.5
         # The logistic function turns logit(value) ∓ half width back into fractions.
         ends = 1 / (1 + np.exp(np.stack([half_width, -half_width]) - _logit(inner)))
-        without_variance = wilson(value, self.unit_count, quantile)
-        return np.where(variance > 0, ends, without_variance)
+        return np.where(variance > 0, ends, wilson(value, self.unit_count, quantile))
 
     @property
     def is_open(self) -> np.ndarray:
@@ -127,7 +126,7 @@ def leave_out(statistic: Callable[..., np.ndarray], units: Units) -> list[Jackkn
     networks on the same images are therefore paired. `statistic` takes, for each group, how often
     each of its n images counts, shape (k, n), and returns an array of shape (M, ..., k).
     """
-    # Each image counts once at first. The axis of length 1 is for what is left out, as in `kept`.
+    # Each image counts once at first. The axis of length 1 is for what is left out (`is_kept`).
     counts = [np.ones((1, len(unit_of_image)), int) for unit_of_image in units.groups]
     values = statistic(*counts)
     unit_counts = [int(unit_of_image.max()) + 1 for unit_of_image in units.groups]
@@ -144,8 +143,7 @@ def leave_out(statistic: Callable[..., np.ndarray], units: Units) -> list[Jackkn
         # Row p leaves out the images of part p, shape (k, n).
         is_kept = part_of_image != np.arange(part_count)[:, None]
         # The images of all other groups remain.
-        kept = [*counts[:group], is_kept.astype(int), *counts[group + 1 :]]
-        without.append(statistic(*kept))
+        without.append(statistic(*counts[:group], is_kept.astype(int), *counts[group + 1 :]))
     # One row for each of the M statistics.
     rows = zip(values[..., 0], *without, strict=True)
     return [Jackknife(value, others, min(unit_counts), units.over) for value, *others in rows]
@@ -179,9 +177,8 @@ def leave_out_of_roc(
         missing = float(rate) * count - is_above.sum()
         # `hits` says which part of each negative counts as above the threshold.
         hits = is_above + is_tied * missing / is_tied.sum()
-        rates = leave_out_of_mean(hits, Units(units.groups[1:], ""))
         # Numbers of negatives above both ends of the interval of the threshold, shape (2,).
-        exceeding = rates.interval * count
+        exceeding = leave_out_of_mean(hits, Units(units.groups[1:], "")).interval * count
         places = exceeding.astype(int).clip(max=count - 1)
         is_detected = positives > descending[places, None]
         # Nothing is detected if the threshold may be above all scores.
@@ -216,9 +213,8 @@ def change(
     run i of both has the same seed.
     """
     one, other = average(after), average(before)
-    over = max(one.over, other.over, key=len)
     low, high = map(float, change_ends(one, other, is_paired))
-    return Estimate(float(one.value - other.value), low, high, over)
+    return Estimate(float(one.value - other.value), low, high, max(one.over, other.over, key=len))
 
 
 def change_ends(one: Jackknife, other: Jackknife, is_paired: bool = True) -> np.ndarray:
@@ -263,10 +259,9 @@ def _half_width(
 
 def _covariance(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Compute the jackknife covariance of statistics from their values (..., k) without units."""
-    count = one.shape[-1]
     # Equal values may differ from their mean by rounding, which is no variance.
     deviations = ((x - x.mean(axis=-1, keepdims=True)).round(12) for x in (one, other))
-    return (count - 1) * np.mean(np.multiply(*deviations), axis=-1)
+    return (one.shape[-1] - 1) * np.mean(np.multiply(*deviations), axis=-1)
 
 
 def _spread(without: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -307,9 +302,8 @@ def class_means(
     top-1, and `counts` says how often each image counts.
     """
     _, class_of_image, class_sizes = np.unique(names, return_inverse=True, return_counts=True)
-    weights = 1 / class_sizes[class_of_image]
     # Sums in the same order make a mean of ones exactly 1.
-    weight_of_image = weights * counts
+    weight_of_image = 1 / class_sizes[class_of_image] * counts
     return (hits[..., None, :] * weight_of_image).sum(axis=-1) / weight_of_image.sum(axis=-1)
 
 
@@ -388,8 +382,7 @@ def roc_curve(
     threshold minus infinity, which all scores exceed. Return the false-positive rates, the recalls
     and the descending thresholds.
     """
-    distinct_scores = np.unique([*positives, *negatives])
-    descending_thresholds = np.append(distinct_scores[::-1], -np.inf)
+    descending_thresholds = np.append(np.unique([*positives, *negatives])[::-1], -np.inf)
     false_positive_rate, recall = (
         (len(scores) - np.sort(scores).searchsorted(descending_thresholds, "right")) / len(scores)
         for scores in (negatives, positives)

@@ -118,8 +118,7 @@ def plot_curves(
         method: [[(x, y) for x, y in points if y is not None] for points in seeds]
         for method, seeds in methods.items()
     }
-    every_line = chain(*lines_of_method.values())
-    if all(len({y for _, y in line}) < 2 for line in every_line):
+    if all(len({y for _, y in line}) < 2 for line in chain(*lines_of_method.values())):
         return None
     # The last value of each line, whose mean the description states.
     ends = {

@@ -170,8 +170,7 @@ def read_predictions(path: Path, label: str | Sequence[str]) -> Predictions:
             rows = list(csv.DictReader(file))
         photographs = []
         for row in rows:
-            hard_negatives = split_sources(row["hard_negatives"])
-            about = row["source"] or None, hard_negatives, row["mesh"] or None
+            about = row["source"] or None, split_sources(row["hard_negatives"]), row["mesh"] or None
             photographs.append(Photograph(PurePosixPath(row["path"]), row["label"], *about))
 
         # An empty cell is the value `unknown`. Without one, it raises ValueError.

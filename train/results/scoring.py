@@ -382,16 +382,14 @@ def format_scores(scores: Scores) -> str:
     names = [*_fraction_metrics(scores), *RANKING_METRICS]
     groups = [("all", scores.overall), *scores.by_label.items(), *scores.groups.items()]
     rows = [[title, *map(of_group.find, names)] for title, of_group in groups]
-    header = ["", *(TITLES[name] for name in names)]
-    table = tables.table_of("", header, rows, _format_metric)
+    table = tables.table_of("", ["", *(TITLES[name] for name in names)], rows, _format_metric)
     parts = [_count_images(scores), table, _class_table(scores), *_notes(scores)]
     return "\n\n".join(map(str, parts))
 
 
 def _count_images(scores: Scores) -> str:
     """Say how many positive and negative images were scored."""
-    positives = len(scores.pooled.positives)
-    negatives = len(scores.pooled.negatives)
+    positives, negatives = len(scores.pooled.positives), len(scores.pooled.negatives)
     each = metrics.COUNTED_EACH if scores.by_label else ""
     return f"{positives} images of {scores.label}, {negatives} negatives{each}"
 

@@ -207,12 +207,10 @@ def _read(folder: Path) -> RunSummary:
         label = state.get("settings", {}).get("label") or of_points
         if label:
             settings["label"] = label
-        # None for a network that was not scored on test images.
-        accuracy = stored.get("test/accuracy")
         # Scores on photographs are mappings. Others are numbers.
-        found = {key: value for key, value in stored.items() if isinstance(value, dict)}
-        scores = {key: StoredScores.read(value) for key, value in found.items()}
-        return RunSummary(folder, name, settings, scores, accuracy)
+        scores = {key: StoredScores.read(of) for key, of in stored.items() if isinstance(of, dict)}
+        # The accuracy is None for a network that was not scored on test images.
+        return RunSummary(folder, name, settings, scores, stored.get("test/accuracy"))
     advice = "let its run finish or resume it, or give another folder"
     raise InputError(f"{folder} holds no finished run: {advice}")
 
@@ -250,10 +248,9 @@ def varied_settings(runs: Sequence[RunSummary]) -> dict[str, str]:
     The kind of renders and the seed are left out, because tables always show them.
     """
     keys = {key for run in runs for key in run.settings} - {"augment.mode", "seed"}
-    # "train.learning_rate" becomes "learning rate".
-    prefixes = r"^(augment|train|scene|renderer|evaluate)\.|[._]"
     return {
-        key: re.sub(prefixes, " ", key).strip()
+        # "train.learning_rate" becomes "learning rate".
+        key: re.sub(r"^(augment|train|scene|renderer|evaluate)\.|[._]", " ", key).strip()
         for key in sorted(keys)
         if any(run.settings.get(key) != runs[0].settings.get(key) for run in runs)
     }

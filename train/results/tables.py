@@ -150,8 +150,7 @@ def format_fraction(proportion: Proportion) -> str:
     """Format a fraction of images with its interval. An example is "8 of 40 [10%, 35%]"."""
     if proportion.n == 0:
         return "-"
-    counts = f"{proportion.hits} of {proportion.n}"
-    return f"{counts} [{proportion.low:.0%}, {proportion.high:.0%}]"
+    return f"{proportion.hits} of {proportion.n} [{proportion.low:.0%}, {proportion.high:.0%}]"
 
 
 def format_interval(estimate: Estimate | None, sign: str = "", form: str = ".3f") -> str:
