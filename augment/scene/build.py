@@ -395,9 +395,11 @@ def degree_of_scene(smoothest: Smoothest, given: int | None, pixels: int) -> int
 def _warn_of_wrong_irradiance(name: str, light: Tensor, degree: int) -> None:
     """Warn if a named lighting has too low a degree for its irradiance.
 
-    The irradiance is compared with that of the same lighting of degree 8.
+    The irradiance is compared with that of the same lighting without a window, of a degree that is
+    high enough.
     """
-    error = float(harmonics.irradiance_error(light, load_light(name, REFERENCE_DEGREE)))
+    reference = degree if degree >= REFERENCE_DEGREE // 2 else REFERENCE_DEGREE
+    error = float(harmonics.irradiance_error(light, load_light(name, reference)))
     if error > MAX_IRRADIANCE_ERROR:
         reason = f"has an irradiance that is off by {error:.0%} (rms over normals)"
         advice = "and attacks of it have the same degree: give a higher degree"

@@ -202,7 +202,9 @@ class GltfFile:
 
 def _chunks(content: bytes) -> tuple[bytes, bytes | None]:
     """Return the JSON object and the binary chunk, if there is one, of a .glb file (4.4)."""
-    length, json_length = struct.unpack_from("<8x2I", content)
+    version, length, json_length = struct.unpack_from("<4x3I", content)
+    if version != 2:
+        raise ValueError(f"it is glTF {version}.0: export it as glTF 2.0")
     if length > len(content):
         raise ValueError("its end is missing: copy the file again")
     end = 20 + json_length

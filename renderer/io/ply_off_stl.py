@@ -167,6 +167,8 @@ def _elements(content: bytes) -> tuple[dict[str, _Values], list[str]]:
                 pass
             case _:
                 raise ValueError(f"the header has an unknown line: {line}")
+    if form not in _BYTE_ORDERS:
+        raise ValueError(f"the format is {form}: choose {', '.join(_BYTE_ORDERS)}")
     body = content[header.end() :]
     # Text becomes float64 numbers, which are then read like a binary file.
     if form == _ASCII:

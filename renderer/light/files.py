@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+from functools import lru_cache
 from pathlib import Path
 from typing import TypeVar
 
@@ -274,7 +275,8 @@ def _read_light_map(path: Path, degree: int, roughness: float | None) -> Tensor:
 
     `roughness` is that of the smoothest surface, whose highlights must not get dark rings, or None.
     """
-    coefficients = harmonics.project(environment.read_panorama(path), degree)
+    modified = path.stat().st_mtime_ns if path.exists() else 0
+    coefficients = _project_map(path, modified, degree)
     if roughness is not None:
         coefficients = coefficients * window_without_ringing(coefficients, roughness)[:, None]
     luminance = mean_luminance(coefficients)
@@ -282,3 +284,9 @@ def _read_light_map(path: Path, degree: int, roughness: float | None) -> Tensor:
         raise InputError(f"environment map {path} is black: give a map with positive radiance")
     scale = mean_luminance(probe("grace")) / luminance
     return (coefficients * scale).float()
+
+
+@lru_cache(maxsize=1)
+def _project_map(path: Path, modified: int, degree: int) -> Tensor:
+    """Project an environment map. Scenes load the last one with a window and without."""
+    return harmonics.project(environment.read_panorama(path), degree)

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from augment import distributed
 from renderer.errors import InputError, keyed
@@ -39,11 +39,11 @@ from train.results.compare import format_comparison, format_short_comparison
 from train.results.overwrite import remove_run, require_new_run, require_replaceable
 from train.results.page import PAGE, report_of
 from train.results.store import is_finished, summarize
-from train.run_config import CONFIG, format_command, read_config, require_same_run, resume_config
-from train.run_folder import FAILURE, locked, sole_writer, state, writable_folder
+from train.run_config import CONFIG, format_command, require_same_run, resume_config
+from train.run_folder import FAILURE, ORIGINAL, locked, sole_writer, state, writable_folder
 from train.settings import PHOTOGRAPHS_FIRST, ExperimentSettings, NetworkSettings
 from train.system import NO_ROOM, is_verbose, program, shortened, user_message
-from train.training.inputs import Initial, load_initial, load_inputs, with_label
+from train.training.inputs import load_inputs, with_label
 from train.training.run import Run
 
 # Name of the log file in the folder of a training run.
@@ -104,16 +104,6 @@ def _train_on_photographs(settings: ExperimentSettings, command: str) -> Experim
     return replace(settings, photographs_first=False, trust=True, network=str(first), **cleared)
 
 
-def _load_original(settings: ExperimentSettings, folder: Path) -> Initial | None:
-    """Load the network before a first training on photographs, if there was one."""
-    first = folder / PHOTOGRAPHS_FIRST
-    if settings.network != str(first):
-        return None
-    # The file has facts beside the settings.
-    recorded = OmegaConf.masked_copy(read_config(first / CONFIG), [*vars(settings)])
-    return load_initial(read_settings(ExperimentSettings, recorded))
-
-
 def _train_in(folder: Path, settings: ExperimentSettings, command: str, out: Path) -> None:
     """Check that the folders can be written to, and train a network and its baselines.
 
@@ -136,14 +126,16 @@ def _train_in(folder: Path, settings: ExperimentSettings, command: str, out: Pat
             first_process.enter_context(logged_to(writable_folder(folder, "out") / LOG))
             first_process.enter_context(sole_writer(*settings_of_runs))
         try:
-            inputs = load_inputs(next(iter(settings_of_runs.values())))
+            data, initial = load_inputs(next(iter(settings_of_runs.values())))
             # All mistakes are reported before the first run is trained.
-            given = command, _load_original(settings, folder)
-            runs = [Run(of, *inputs, path, *given) for path, of in settings_of_runs.items()]
+            runs = [Run(of, data, initial, path, command) for path, of in settings_of_runs.items()]
             # The main run is the last one. It begins first, because it also removes the earlier
             # runs in the subfolders of its folder, to which the baselines write.
             for run in reversed(runs):
                 run.begin()
+            if initial and folder.name == PHOTOGRAPHS_FIRST and distributed.rank() == 0:
+                state = {"architecture": initial.architecture, "model": initial.weights}
+                checkpoints.save(folder / ORIGINAL, state)
             for run in runs:
                 console.debug("\n== %s", run.folder)
                 run.train()

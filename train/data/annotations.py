@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, NamedTuple
@@ -132,9 +133,14 @@ def read_masks(folder: Path) -> tuple[list[Annotated], dict[str, Path], list[str
     else:
         raise InputError(f"photos={folder} lacks images/ or masks/: move them there", "photos")
     shown = [str(item.path) for item in find_unlabeled(images)]
-    places = ((name, masks / form) for name in shown for form in _spellings(name))
-    all_paths = ((name, place.with_suffix(".png")) for name, place in places)
-    paths = {name: path for name, path in all_paths if path.is_file()}
+    all_paths = {name: (masks / name).with_suffix(".png") for name in shown}
+    paths = {name: path for name, path in all_paths.items() if path.is_file()}
+    # Other masks, whose names may have another form of Unicode than those of the photographs.
+    others = {*masks.rglob("*.png")} - {*paths.values()} if len(paths) < len(shown) else ()
+    by_form = {normalize("NFC", str(path)): path for path in others}
+    forms = {name: normalize("NFC", str(path)) for name, path in all_paths.items()}
+    missing = [name for name in shown if name not in paths]
+    paths |= {name: by_form[forms[name]] for name in missing if forms[name] in by_form}
     missing = [name for name in shown if name not in paths]
     if not paths:
         first = Path(missing[0]).with_suffix(".png")
@@ -268,32 +274,34 @@ def _find_images(file: Path, names: Sequence[str]) -> dict[str, Path]:
     is_beside = file.parent.name != "annotations"
     folders = [file.parent] if is_beside else [file.parent.parent, file.parent]
     # An image beside the file replaces one in the folder above.
-    places = ((name, of / form) for of in folders for name in names for form in _spellings(name))
-    paths = {name: path for name, path in places if path.is_file()}
-    # Other images in the folder, by name without folder. Most files need no search.
-    others: dict[str, list[Path]] = defaultdict(list)
-    used = {*paths.values()}
-    for path in visible_files(folders[0]) if len(paths) < len(names) else ():
-        if path.suffix.lower() in SUFFIXES and folders[0] / path not in used:
-            others[normalize("NFC", path.name)].append(folders[0] / path)
-    uses = Counter(PurePosixPath(normalize("NFC", name)).name for name in names)
-    for name in [name for name in names if name not in paths]:
-        parts = PurePosixPath(normalize("NFC", name)).parts
-        # Number of equal parts at the end of the path of each image of this name.
-        equal_parts = {
-            image: _equal_ends(Path(normalize("NFC", str(image))).parts, parts)
-            for image in others[parts[-1]]
-        }
-        most = max(equal_parts.values(), default=0)
-        # An image in another folder may be any of several that have its name.
-        if most == 1 and uses[parts[-1]] > 1:
-            continue
-        found = [image for image in equal_parts if equal_parts[image] == most]
-        if len(found) > 1:
-            listed = " and ".join(map(str, found[:2]))
-            raise InputError(f"{file} names the image {name}, which may be {listed}")
-        if found:
-            paths[name] = found[0]
+    paths = {name: of / name for of in folders for name in names if (of / name).is_file()}
+    # Names that no file has exactly may have another form of Unicode: archives of a Mac change it.
+    for form in (str, partial(normalize, "NFC")):
+        missing = [name for name in names if name not in paths]
+        # Other images in the folder, by name without folder. Most files need no search.
+        others: dict[str, list[Path]] = defaultdict(list)
+        used = {*paths.values()}
+        for path in visible_files(folders[0]) if missing else ():
+            if path.suffix.lower() in SUFFIXES and folders[0] / path not in used:
+                others[form(path.name)].append(folders[0] / path)
+        uses = Counter(form(PurePosixPath(name).name) for name in names)
+        for name in missing:
+            parts = PurePosixPath(form(name)).parts
+            # Number of equal parts at the end of the path of each image of this name.
+            equal_parts = {
+                image: _equal_ends(Path(form(str(image))).parts, parts)
+                for image in others[parts[-1]]
+            }
+            most = max(equal_parts.values(), default=0)
+            # An image in another folder may be any of several that have its name.
+            if most == 1 and uses[parts[-1]] > 1:
+                continue
+            found = [image for image in equal_parts if equal_parts[image] == most]
+            if len(found) > 1:
+                listed = " and ".join(map(str, found[:2]))
+                raise InputError(f"{file} names the image {name}, which may be {listed}")
+            if found:
+                paths[name] = found[0]
     return paths
 
 
@@ -365,13 +373,9 @@ def _label_files(path: Path) -> list[Path]:
     above, images, below = beside.absolute().as_posix().rpartition("/images/")
     if images:
         files.insert(0, Path(f"{above}/labels/{below}"))
-    forms = [file.with_name(form) for file in files for form in _spellings(file.name)]
+    # Accents in names may have another form of Unicode, since archives of a Mac change them.
+    forms = [file.with_name(normalize(form, file.name)) for file in files for form in FORMS]
     return [*files, *forms]
-
-
-def _spellings(name: str) -> list[str]:
-    """Return the other forms of Unicode of a name, which archives of a Mac change, and the name."""
-    return [*({normalize(form, name) for form in FORMS} - {name}), name]
 
 
 def _yaml_mapping(file: Path) -> dict[str, Any]:

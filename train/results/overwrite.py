@@ -14,7 +14,7 @@ from train.results.page import PAGE
 from train.results.predictions import RELIT, SUMMARY, SWEEP_FIGURE, SWEEP_TABLE, TRANSFERS
 from train.results.store import is_finished
 from train.run_config import CONFIG, read_config
-from train.run_folder import BEFORE, METRICS, writable_folder
+from train.run_folder import BEFORE, METRICS, ORIGINAL, writable_folder
 from train.settings import KEPT_ASIDE, PHOTOGRAPHS_FIRST
 
 # Files of an audit, as patterns of `Path.glob`.
@@ -83,7 +83,7 @@ def remove_run(folder: Path, *, with_others: bool = True) -> None:
     removal is stopped, what is left belongs to the run that config.yaml describes. The log stays.
     `with_others=False` keeps the first training and the baselines, which may be resumed.
     """
-    names = (*OF_RUN, run_folder.FAILURE, PAGE, run_folder.RENDERS, BEFORE, KEPT_ASIDE)
+    names = (*OF_RUN, ORIGINAL, run_folder.FAILURE, PAGE, run_folder.RENDERS, BEFORE, KEPT_ASIDE)
     logs = [*folder.glob("events.out.tfevents.*"), *folder.glob(f"*/{SUMMARY}")]
     remove(*(folder / name for name in names), *logs)
     with suppress(InputError):  # config.yaml may be missing.

@@ -223,9 +223,11 @@ def _read_run(folder: Path) -> RunSummary:
     before = None
     if "test/accuracy_before" in scores:
         path = folder / BEFORE
-        # The settings that determine the initial network.
+        # The settings that determine the network before all training.
+        original = run_folder.find_original(folder, config.network)
+        config_of_network = read_config(original.with_name(CONFIG)) if original else config
         keys = ("network", "weights", "classes", "normalization", "normalize_light", "size")
-        settings = {key: OmegaConf.select(config, key) for key in keys}
+        settings = {key: OmegaConf.select(config_of_network, key) for key in keys}
         accuracy = scores["test/accuracy_before"]
         before = RunSummary(path, INITIAL, settings, read_summaries(path), accuracy)
     settings = run_config.decisive_settings(config)

@@ -30,7 +30,7 @@ from train.results.overwrite import remove_run
 from train.results.predictions import SUMMARY
 from train.results.scoring import Model, Predictor, evaluate_photographs, format_scores
 from train.run_config import CONFIG, require_same_run, require_same_weights, write_config
-from train.run_folder import BEFORE, BEST, WEIGHTS
+from train.run_folder import BEFORE, BEST, WEIGHTS, find_original
 from train.settings import KEPT_ASIDE, LABORATORY, WIDERESNET, ExperimentSettings, in_light
 from train.training import inputs
 from train.training.averages import INTERPOLATION, interpolate, predict
@@ -56,7 +56,6 @@ class Run:
     Attributes:
         data: Data set. Its labels become indices into the classes of the network.
         scored_folders: Folders of photographs or renders on which the networks are scored, by name.
-        original: Network before a first training on photographs, which made `initial`.
         held_out: Whether each training image validates the network.
     """
 
@@ -65,7 +64,6 @@ class Run:
     initial: inputs.Initial | None
     folder: Path
     command: str = ""
-    original: inputs.Initial | None = None
 
     def __post_init__(self) -> None:
         """Check all inputs and build the network. If the run is resumed, restore its checkpoint."""
@@ -114,10 +112,11 @@ class Run:
                 recognizing_layers(self.trainer.model.network, self.data.size)
         # Network that the scores call the one before the training.
         self.before = self.trainer.initial
-        if self.before and self.original:
+        original = find_original(folder, settings.network)
+        if self.before and original:
             self.before = deepcopy(self.before)
             network = exposure.without_normalized_light(self.before.network)
-            self.original.copy_to(network, self.trainer.architecture)
+            network.load_state_dict(checkpoints.load(original)["model"])
         # Number of CPU threads with which the run trains.
         self._threads = torch.get_num_threads()
         if self._is_resumed:
