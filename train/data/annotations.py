@@ -365,8 +365,7 @@ def _label_files(path: Path) -> list[Path]:
     above, images, below = beside.absolute().as_posix().rpartition("/images/")
     if images:
         files.insert(0, Path(f"{above}/labels/{below}"))
-    forms = [file.with_name(form) for file in files for form in _spellings(file.name)]
-    return [*files, *forms]
+    return [*files, *(file.with_name(form) for file in files for form in _spellings(file.name))]
 
 
 def _spellings(name: str) -> list[str]:
@@ -497,8 +496,7 @@ def _upright_boxes(photograph: Annotated, upright: Float[np.ndarray, "2"]) -> np
             fault = f"{photograph.path} has {upright[0]:g} × {upright[1]:g} pixels"
             raise InputError(f"{fault}, but its boxes are for {marked[0]:g} × {marked[1]:g}")
         corners = corners[..., ::-1] if orientation in range(5, 9) else corners
-        is_flipped = [orientation in flipped for flipped in FLIPPED]
-        corners = np.where(is_flipped, 1 - corners, corners)
+        corners = np.where([orientation in flipped for flipped in FLIPPED], 1 - corners, corners)
     # A turn exchanges corners, so the sides are the smaller and larger coordinates.
     corners = np.concatenate([corners.min(1), corners.max(1)], axis=-1)
     return corners * np.tile(upright, 2)
