@@ -166,9 +166,7 @@ def _render_blocks(
 ) -> Iterator[LabeledRender]:
     """Yield renders with ascending indices, one block after another."""
     # Without a network, nothing asks for the classes.
-    of_network: dict[str, Any] = {}
-    if network is not None:
-        of_network = {"task": network.task, "classes": network.classes}
+    of_network: Any = {} if network is None else {"task": network.task, "classes": network.classes}
     # The examples of the scene are sorted by object, view and background.
     of_objects = torch.arange(len(scene)).view(len(scene.objects), -1)
     # In random order, so that each part of a data set shows all sides of the objects.

@@ -141,8 +141,7 @@ def _read_preprocessor(
         return processor(images=image, return_tensors="pt")["pixel_values"][0]
 
     # Networks of images and texts have a configuration of their vision part.
-    vision = getattr(config, "vision_config", config)
-    of_config = getattr(vision, "image_size", None)
+    of_config = getattr(getattr(config, "vision_config", config), "image_size", None)
     size: Size = of_config if isinstance(of_config, int) else USUAL_SIZE
     sizer = FILE if isinstance(of_config, int) else None
     if processor is None:

@@ -471,8 +471,7 @@ def _relight(
     else:
         unit = colors.to(dtype) / largest
         # The largest value of an image above 1 is its white, at which a sensor is full.
-        white = unit.detach().amax((1, 2, 3), keepdim=True).clamp(min=1)
-        white = decode(white, "srgb")
+        white = decode(unit.detach().amax((1, 2, 3), keepdim=True).clamp(min=1), "srgb")
         linear = model.camera(decode(unit, "srgb") * light.total(), drawn, strength, white)
         limit = white if model.has_limit else torch.where(white > 1, torch.inf, white)
         encoded = encode(torch.minimum(linear, limit), "srgb")

@@ -74,9 +74,8 @@ def lightning_callback(service: AugmentationService, network: nn.Module | None =
 
         def regenerate(self, epoch: int, pl_module: Any) -> None:
             """Attack the weights as they are now."""
-            attacked = pl_module if network is None else network
             self.epoch = epoch
-            made = service.regenerate(attacked, self.epoch)
+            made = service.regenerate(pl_module if network is None else network, epoch)
             self.renders.current, self.diagnostics = made, made.diagnostics
 
         def on_load_checkpoint(self, trainer: Any, pl_module: Any, checkpoint: Any) -> None:

@@ -98,12 +98,11 @@ class Network(nn.Module):
         if isinstance(network, nn.parallel.DistributedDataParallel):
             # Its passes wait for those of the other processes, which may make fewer of them.
             network = network.module
-        module = network if isinstance(network, nn.Module) else Function(network)
         self.transforms = nn.ModuleList(transforms)
-        self.network: Any = module
+        self.network: Any = network if isinstance(network, nn.Module) else Function(network)
         # `train` of a network of torch.export raises an error.
         for part in (self, self.transforms, *self.transforms):
-            part.training = module.training
+            part.training = self.network.training
 
     def forward(self, images: Tensor, *targets: Any) -> Any:
         """Compute the outputs of RGB images (N, 3, H, W) in [0, 1].
@@ -196,8 +195,7 @@ class ChannelNormalization(nn.Module):
 
     def forward(self, images: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N 3 H W"]:
         ordered = images.flip(1) if self.bgr else images
-        normalized = (ordered - self.mean) / self.std
-        return normalized.contiguous(memory_format=torch.channels_last)
+        return ((ordered - self.mean) / self.std).contiguous(memory_format=torch.channels_last)
 
 
 class Quantization(nn.Module):
@@ -518,8 +516,7 @@ def normalization_of(network: Any, limits: tuple[float, float] = (0.0, 1.0)) -> 
     black, white = limits
     for module in network.modules() if isinstance(network, nn.Module) else ():
         for name in MEANS:
-            names = name, name.replace("mean", "std")
-            mean, std = (_channels(module, found) for found in names)
+            mean, std = _channels(module, name), _channels(module, name.replace("mean", "std"))
             # A mean alone may be that of three features.
             if mean and (std or name != "mean"):
                 std = std or [1.0] * 3

@@ -488,8 +488,7 @@ class AugmentationService:
         if self._finds_objects:
             # Render all examples, since the attack has images of the attacked ones only.
             return _Made(values, problem.images(values, problem.all_examples)[:, 0], diagnostics)
-        is_new_success = success & ~result.success_before
-        return _Made(values, result.images[:, 0], diagnostics, is_new_success)
+        return _Made(values, result.images[:, 0], diagnostics, success & ~result.success_before)
 
     def _own_rows(self, count: int) -> Int[Tensor, " A"]:
         """Return the indices of those of some examples that this process renders or attacks.

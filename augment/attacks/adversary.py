@@ -322,9 +322,8 @@ def _read_adversary(folder: Path, description: dict[str, Any]) -> Adversary:
     local_lights = [files.read_light(path, *lamps.LOCAL_LIGHTS.values()) for path in paths]
     sky = files.load_light(str(folder / LIGHT), degree=None)
     basis, light = with_local_lights(sky, local_lights)
-    background = description["background"]
-    if isinstance(background, str):
-        background = folder / BACKGROUND
+    gray = description["background"]
+    background = folder / BACKGROUND if isinstance(gray, str) else gray
     shape = (len(cameras), 3, *settings.shape)
     return Adversary(
         shown=SceneObject(label, mesh, albedo_scale, name, own_faces, others),

@@ -341,8 +341,7 @@ def _candidates(settings: Settings, cameras: int, draws: Generator) -> Iterator[
         # The first candidate has the given camera.
         candidate = settings
         if index > 0:
-            becomes_perspective = settings.fov is None and index % 2 == 1
-            fov = FOV if becomes_perspective else settings.fov
+            fov = FOV if settings.fov is None and index % 2 == 1 else settings.fov
             polar, azimuth, width = torch.rand(3, generator=draws).tolist()
             narrowest, widest = WIDTH
             if fov is not None:
@@ -381,8 +380,7 @@ def _best_lights(
     # The first coefficients of an example are its environment light, and the others its projector
     # and lamps.
     lights = torch.cat([skies, scene.lights[examples, skies.shape[1] :]], dim=1)
-    groups = (of_row.split(scene.group_size) for of_row in (lights, examples))
-    pairs = zip(*groups, strict=True)
+    pairs = zip(lights.split(scene.group_size), examples.split(scene.group_size), strict=True)
     images = torch.cat([scene.render(Conditions(light), some) for light, some in pairs])
     confidences = _confidences(scene, images, attack_settings, classifier)
     # Of equal confidences, that of the given light and exposure comes first.

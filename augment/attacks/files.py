@@ -198,12 +198,11 @@ def render_again(folder: Path, names: Sequence[str], rasterizer: Rasterizer) -> 
     if "reload" in names:
         images["reload"] = adversary.render_views(rasterizer)
     if MITSUBA in names:
-        encoding = adversary.settings.encoding
-        shape = adversary.settings.shape
-        rgba = render_mitsuba_scene(folder / MITSUBA / SCENE, len(adversary.cameras), shape)
+        settings, cameras = adversary.settings, adversary.cameras
+        rgba = render_mitsuba_scene(folder / MITSUBA / SCENE, len(cameras), settings.shape)
         # The fourth channel is the coverage of each pixel by the object.
-        background = background_term(rgba[:, 3:], adversary.background, encoding)
-        rendered = encode(clamp(rgba[:, :3] + background), encoding)
+        background = background_term(rgba[:, 3:], adversary.background, settings.encoding)
+        rendered = encode(clamp(rgba[:, :3] + background), settings.encoding)
         if adversary.pixels is not None:
             rendered = clamp(rendered + adversary.pixels)
         images[MITSUBA] = rendered

@@ -188,8 +188,7 @@ def _minimize_group(
         rows = rows[~is_success]
         if not len(rows):
             break
-        part = objective.select(rows)
-        latest = minimize_from(restart[rows], optimizer, part, examples[rows])
+        latest = minimize_from(restart[rows], optimizer, objective.select(rows), examples[rows])
         for name in COUNTS:
             getattr(result, name)[rows] += getattr(latest, name)
         # Where the restart succeeds, its candidate replaces that of the example.

@@ -117,8 +117,7 @@ class NormBalls:
         # The gradient is first divided by its largest entry, because the squares of tiny entries
         # would be rounded to zero.
         tiny = torch.finfo(gradient.dtype).tiny
-        largest = gradient.abs().amax(1, keepdim=True)
-        scaled = gradient / largest.clamp(min=tiny)
+        scaled = gradient / gradient.abs().amax(1, keepdim=True).clamp(min=tiny)
         return self.settings.step_size * torch.nn.functional.normalize(scaled, eps=tiny)
 
     def search_scale(self, examples: Examples) -> Values:
@@ -140,8 +139,7 @@ class NormBalls:
             return length / 2 * used
         # n independent numbers with the standard deviation length / √n form a vector that is
         # about `length` long.
-        used_count = used.sum(1, keepdim=True)
-        return length * used / used_count.clamp(min=1).sqrt()
+        return length * used / used.sum(1, keepdim=True).clamp(min=1).sqrt()
 
     def project(self, values: Values, examples: Examples | slice) -> Values:
         """Find the nearest values that are feasible and lie in the norm-balls around the start."""

@@ -114,8 +114,7 @@ class SceneProblem:
         They are needed only if a parameter has no radius.
         """
         parts = self.split_by_parameter(self.start if reached is None else reached)
-        given = [(each, None if reached is None else part) for each, part in parts]
-        samples = [parameter.sample(generator, part) for parameter, part in given]
+        samples = [one.sample(generator, None if reached is None else part) for one, part in parts]
         return torch.cat(samples, dim=1).to(self.start)
 
     def split_by_parameter(self, values: Values) -> list[tuple[Parameter, Tensor]]:

@@ -501,8 +501,7 @@ def _upright_boxes(photograph: Annotated, upright: Float[np.ndarray, "2"]) -> np
             fault = f"{photograph.path} has {upright[0]:g} × {upright[1]:g} pixels"
             raise InputError(f"{fault}, but its boxes are for {marked[0]:g} × {marked[1]:g}")
         corners = corners[..., ::-1] if orientation in range(5, 9) else corners
-        is_flipped = [orientation in flipped for flipped in FLIPPED]
-        corners = np.where(is_flipped, 1 - corners, corners)
+        corners = np.where([orientation in flipped for flipped in FLIPPED], 1 - corners, corners)
     # A turn exchanges corners, so the sides are the smaller and larger coordinates.
     corners = np.concatenate([corners.min(1), corners.max(1)], axis=-1)
     return corners * np.tile(upright, 2)

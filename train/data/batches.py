@@ -180,8 +180,7 @@ def crop_and_flip(
     device = images.device
     # Row i of result b is copied from row `source_rows[b, i]` of its image, and column j
     # from column `source_columns[b, j]`. The arrays have the shapes (B, H) and (B, W).
-    source_rows = torch.arange(height, device=device) + shifts[0, :, None]
-    source_rows = _reflect(source_rows, height)
+    source_rows = _reflect(torch.arange(height, device=device) + shifts[0, :, None], height)
     source_columns = torch.arange(width, device=device).expand(len(chosen), -1)
     source_columns = torch.where(flips[:, None], source_columns.flip(1), source_columns)
     source_columns = _reflect(source_columns + shifts[1, :, None], width)

@@ -98,10 +98,8 @@ class DataSet:
         }
         if render.depth is not None:
             details["depth_scale"] = _depth_scale(render.depth)
-        files: dict[str, bytes | str] = {image: png(render.image)}
-        for name in self.maps:
-            files[f"{DETAILS}/{number}_{name}.png"] = png(_map(render, name))
-        return files | {f"{DETAILS}/{number}.json": json.dumps(details)}
+        maps = {f"{DETAILS}/{number}_{name}.png": png(_map(render, name)) for name in self.maps}
+        return {image: png(render.image), **maps, f"{DETAILS}/{number}.json": json.dumps(details)}
 
     def is_finished(self) -> bool:
         """Return whether all renders are there."""

@@ -187,9 +187,8 @@ class _Reader(Dataset[tuple[Tensor, ReadErrors]]):
         from torchvision.transforms import v2
 
         self._files = files
-        area = (MIN_CROP_AREA, 1.0)
         bicubic = v2.InterpolationMode.BICUBIC
-        self._crop = v2.RandomResizedCrop(files.size, area, interpolation=bicubic)
+        self._crop = v2.RandomResizedCrop(files.size, (MIN_CROP_AREA, 1.0), interpolation=bicubic)
 
     def __getitem__(self, key: Key) -> tuple[Tensor, ReadErrors]:
         """Read an image, or another image of its subfolder if it cannot be read.
@@ -412,13 +411,12 @@ def load_npz(path: str) -> DataSet:
             classes = archive["classes"]
             if classes.ndim != 1 or classes.dtype.kind != "U" or len({*classes}) != len(classes):
                 raise ValueError("classes must be distinct strings, one per class")
-            splits = [
+            train, test = [
                 _npz_split(archive[f"{name}_images"], archive[f"{name}_labels"], len(classes))
                 for name in progress(("train", "test"), "reading the data")
             ]
-        if splits[0].images.shape[1:] != splits[1].images.shape[1:]:
+        if train.images.shape[1:] != test.images.shape[1:]:
             raise ValueError("train_images and test_images differ in size")
-        train, test = splits
         return DataSet(tuple(classes.tolist()), train, test)
 
 

@@ -60,8 +60,7 @@ def target_of(objects: Int[Tensor, "1 H W"]) -> Target:
     """Return the objects in the map of an image, with the boxes of their visible parts."""
     numbers = objects[objects != NO_OBJECT].unique()
     masks = objects == numbers[:, None, None]
-    labels = numbers.long() % MAX_CLASSES
-    return {"boxes": boxes_of(masks), "labels": labels, "masks": masks.byte()}
+    return {"boxes": boxes_of(masks), "labels": numbers.long() % MAX_CLASSES, "masks": masks.byte()}
 
 
 def losses_of(network: nn.Module, images: Tensor, targets: Sequence[Target]) -> Float[Tensor, ""]:

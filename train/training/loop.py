@@ -339,8 +339,7 @@ class Trainer:
     def evaluate(self, split: Split) -> dict[str, float]:
         """Measure the loss and the accuracy of the selected network."""
         if self.is_detector and self.initial is not None:
-            task = cast(Detection, self.service.task)
-            return validate(self.selected, self.initial, task, split)
+            return validate(self.selected, self.initial, cast(Detection, self.service.task), split)
         return evaluate(self.selected, split)
 
     def _require_finite(self, loss: float, epoch: int) -> None:

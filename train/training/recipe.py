@@ -146,8 +146,7 @@ def freeze(network: nn.Module, stage: str, size: int) -> None:
         examples = nearest(stage, sorted({_module_of(name) for name in names}))
         raise InputError(f"stage={stage} is no module: choose one, such as {examples}", "stage")
     # All parameters up to the last one of the stage are frozen.
-    frozen_count = names.index(chosen[-1]) + 1
-    for parameter in list(network.parameters())[:frozen_count]:
+    for parameter in list(network.parameters())[: names.index(chosen[-1]) + 1]:
         parameter.requires_grad_(False)
 
 

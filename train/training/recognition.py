@@ -93,8 +93,7 @@ def logistic_weights(
     """Return the weights of a logistic regression in which both classes count the same."""
     deviations, means = torch.std_mean(values, 0)
     # A value that differs only by rounding would get a huge weight.
-    typical = deviations[deviations > 0].median().item()
-    deviations = deviations.clamp(min=SMALLEST * typical)
+    deviations = deviations.clamp(min=SMALLEST * deviations[deviations > 0].median().item())
     standardized = (values - means) / deviations
     wanted = is_positive.to(values)
     counts = torch.where(is_positive, is_positive.sum(), (~is_positive).sum())

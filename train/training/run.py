@@ -138,10 +138,9 @@ class Run:
         settings, data, initial = self.settings, self.data, self.initial
         recipe = settings.train
         shape = _network_shape(settings, initial)
-        images = data.train.images
+        stored = data.train.images
         # Images on disk: some of them tell mean and standard deviation.
-        if not isinstance(images, Tensor):
-            images = data.train.sample(SAMPLED)
+        images = stored if isinstance(stored, Tensor) else data.train.sample(SAMPLED)
         mean, std = channel_statistics(images)
         torch.manual_seed(stream_seed(settings.seed, "weights"))
         # The shape of a classifier has the normalization of the classifier.
@@ -208,9 +207,8 @@ class Run:
         hardware = {"device": device, "precision": model.precision, "threads": self._threads}
         images = self._inputs.describe(model, self.data.size)
         test_images = inputs.describe_test_images(self.settings, self.data)
-        facts = {"hardware": hardware, "command": self.command}
-        facts |= {"images": images, "test_images": test_images, "hashes": self._hashes}
-        write_config(self.folder, self.settings, **facts)
+        facts = {"images": images, "test_images": test_images, "hashes": self._hashes}
+        write_config(self.folder, self.settings, hardware=hardware, command=self.command, **facts)
 
     def train(self, logger: Logger | None = None) -> dict[str, float]:
         """Train to the last epoch, score the network, and return the final scores by name.
@@ -224,9 +222,7 @@ class Run:
         log = RunLog(self.folder, trainer.history, logger) if distributed.rank() == 0 else None
         if log:
             self._render_kept_aside()
-        scores: dict[str, float] = {}
-        if self.before and not trainer.is_detector:
-            scores = self._score_initial(self.before)
+        scores = self._score_initial(self.before) if self.before and not trainer.is_detector else {}
         # `_score_initial` may have replaced labels. An unreadable file is replaced in its own part.
         split = self.data.train.to(trainer.device)
         train, validation = (split.part(rows) for rows in (~self.held_out, self.held_out))

@@ -105,7 +105,6 @@ class RunLog:
         """
         # A negative label is complementary: the render shows no object of the positive class.
         labels = [classes[one] if one >= 0 else "negative" for one in found.labels]
-        basis = found.basis
         columns = {}
         # The fields of `found` have the state before the attack at index 0,
         # and the state after it at index 1.
@@ -119,7 +118,7 @@ class RunLog:
             reduced = interpolate(images, min(EXAMPLE, images.shape[-1]), mode="area")
             columns[name] = tiles_of(reduced, captions, EXAMPLE)
             lights = found.lights[index]
-            balls = (light_sphere(light, EXAMPLE // 2, basis=basis) for light in lights)
+            balls = (light_sphere(light, EXAMPLE // 2, basis=found.basis) for light in lights)
             columns[f"light {name}"] = tiles_of(balls)
         self._renders.mkdir(exist_ok=True)
         grid = draw_grid([*zip(*columns.values(), strict=True)], [*columns])

@@ -86,9 +86,8 @@ def replace_light(
     # A scene with a single light needs no concatenation.
     if coefficients.shape[1] == all_lights.shape[1]:
         return replace(conditions, light=coefficients)
-    before = all_lights[:, : rows.start]
-    after = all_lights[:, rows.stop :]
-    return replace(conditions, light=torch.cat([before, coefficients, after], dim=1))
+    parts = [all_lights[:, : rows.start], coefficients, all_lights[:, rows.stop :]]
+    return replace(conditions, light=torch.cat(parts, dim=1))
 
 
 # An attack on a daylight sky changes three values: two angles of the sun, and the turbidity (haze)
@@ -124,8 +123,7 @@ class Skylight(Parameter):
         self._rows, self._basis = scene.basis.lights[0]
         initial_sky = sky_coefficients(settings.zenith, settings.azimuth, settings.turbidity)
         sky_luminance = mean_luminance(initial_sky)
-        replaced_lights = scene.lights[:, self._rows]
-        scales = [mean_luminance(light) / sky_luminance for light in replaced_lights]
+        scales = [mean_luminance(light) / sky_luminance for light in scene.lights[:, self._rows]]
         # Factor by which the sky is multiplied in each example, shape (E,).
         self._scale = torch.tensor(scales, dtype=torch.float64, device=scene.lights.device)
 
@@ -146,14 +144,12 @@ class Skylight(Parameter):
         """
         # Convert the angles to degrees in float64, so that rounding is negligible.
         zenith, azimuth = (values[:, :2].double() * self._units[0]).unbind(1)
-        turbidity = values[:, 2] * TURBIDITY_UNIT
-        sky = sky_coefficients(zenith, azimuth, turbidity)
+        sky = sky_coefficients(zenith, azimuth, values[:, 2] * TURBIDITY_UNIT)
         sky = sky * self._scale[examples, None, None]
         if self._window is not None:
             sky = sky * self._window.to(sky)[:, None]
         # The lighting of the scene may have more coefficients. Those of the sky are then 0.
-        missing_count = self._basis.size - sky.shape[-2]
-        sky = F.pad(sky, (0, 0, 0, missing_count))
+        sky = F.pad(sky, (0, 0, 0, self._basis.size - sky.shape[-2]))
         return replace_light(conditions, self._rows, sky.to(conditions.light))
 
     def described(self, values: Float[Tensor, " 3"]) -> dict[str, float]:

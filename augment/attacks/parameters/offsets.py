@@ -41,9 +41,8 @@ class MeshParameter(Parameter):
         # One row for each object, one column for each of the N vertices or faces of the largest
         # mesh. Rows of smaller meshes end with False.
         masks = pad_sequence([torch.from_numpy(mask) for mask in object_masks], batch_first=True)
-        # Three values for each vertex or face, shape (objects, 3 N).
-        value_masks = masks.to(scene.lights.device).repeat_interleave(3, dim=1)
-        used_mask = value_masks[scene.object_of]
+        # Three values for each vertex or face, shape (E, 3 N).
+        used_mask = masks.to(scene.lights.device).repeat_interleave(3, dim=1)[scene.object_of]
         start = scene.lights.new_zeros(used_mask.shape)
         super().__init__(settings, start=start, used_mask=used_mask)
 

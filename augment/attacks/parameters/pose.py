@@ -97,9 +97,8 @@ class Pose(Parameter):
         """
         objects = self._scene.object_of[examples]
         changes = values * self._unit
-        vertices = conditions.vertices
-        if vertices is None:
-            vertices = self._scene.vertices[objects]
+        given = conditions.vertices
+        vertices = self._scene.vertices[objects] if given is None else given
         moved_vertices = [*map(self._moved, objects.tolist(), vertices, changes)]
         # `stack` refuses an empty list, as there is without examples.
         if moved_vertices:
@@ -118,8 +117,7 @@ class Pose(Parameter):
         scaled = change[SCALE].exp() * vertices
         rotated = scaled @ rotation_matrices(change[ROTATION]).T
         # Append 0 for the shift along z.
-        shift = F.pad(change[SHIFT], (0, 1))
-        moved = rotated + shift
+        moved = rotated + F.pad(change[SHIFT], (0, 1))
         # Lift the object until its lowest vertex is on the ground.
         if ground_height is not None:
             lift = ground_height - moved[object_mask, 2].amin()
