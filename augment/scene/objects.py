@@ -114,8 +114,7 @@ class SceneObject:
 
         The other vertices belong to faces of other objects or of a table.
         """
-        corners_of_others = self.mesh.faces[~self.own_faces]
-        return ~np.isin(np.arange(len(self.mesh.vertices)), corners_of_others)
+        return ~np.isin(np.arange(len(self.mesh.vertices)), self.mesh.faces[~self.own_faces])
 
     @property
     def own_mesh(self) -> Mesh:

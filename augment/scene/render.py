@@ -182,8 +182,7 @@ class OperatorRenderer:
         background_terms = background_term(coverage, backgrounds, self.settings.encoding)
         # Number the images of the stack in their order: 0 for the first True of the mask, and so
         # on.
-        image_to_stack_image = is_in_stack.cumsum(0) - 1
-        return _BuiltStack(stack, image_to_stack_image, background_terms)
+        return _BuiltStack(stack, is_in_stack.cumsum(0) - 1, background_terms)
 
 
 # Largest number of samples of the rasterized views that are kept, which take about a gigabyte.
@@ -428,8 +427,7 @@ class DirectRenderer:
         normals = normalize(normals, dim=1) * fragments.facing[seen_face]
         # Depth and the three components of the normal, shape (4, P).
         at_pixels = torch.cat([depth[None], normals.T])
-        samples = len(cameras) * self.settings.pixel_count
-        maps = torch.zeros(4, samples, dtype=torch.float32)
+        maps = torch.zeros(4, len(cameras) * self.settings.pixel_count, dtype=torch.float32)
         is_covered = fragments.coverage >= COVERED
         maps[:, fragments.pixels[is_covered]] = at_pixels[:, is_covered].float()
         return maps.view(4, -1, *self.settings.shape).transpose(0, 1)
