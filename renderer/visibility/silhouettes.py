@@ -439,8 +439,7 @@ def _cut_edges(
     line = torch.arange(len(edge), device=edge.device) - (cuts_before_edge - first_line)[edge]
     # Position of the crossing on the edge, from 0 at the start of the edge to 1 at its end.
     fraction = (line - start[0, edge]) / (end[0] - start[0])[edge]
-    position = start[1, edge] + fraction * (end[1] - start[1])[edge]
-    next_sample = position.ceil().long()
+    next_sample = (start[1, edge] + fraction * (end[1] - start[1])[edge]).ceil().long()
     is_inside = (next_sample > 0) & (next_sample < shape[1])
     return edge[is_inside], line[is_inside], fraction[is_inside], next_sample[is_inside]
 
