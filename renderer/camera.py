@@ -523,8 +523,7 @@ def orbit_cameras(
     3.732
     """
     errors.require_whole("views", views, 1, MAX_VIEWS)
-    names = ("width", "polar", "azimuth")
-    width, polar, azimuth = map(_as_scalar, names, (width, polar, azimuth))
+    width, polar, azimuth = map(_as_scalar, ("width", "polar", "azimuth"), (width, polar, azimuth))
     errors.require_range("azimuth", azimuth, -MAX_TURN, MAX_TURN)
     azimuths = [azimuth + 360 * view / views for view in range(views)]
     if fov is None:

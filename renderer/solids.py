@@ -79,8 +79,7 @@ def orange(rng: Random) -> Mesh:
     directions, faces = sphere()
     angle_from_top = np.arccos(np.clip(directions[:, 2], -1, 1))
     pores = ripples(rng, directions, wavelength=0.2)
-    waves = ripples(rng, directions, wavelength=2.0)
-    dents = 0.01 * waves - 0.04 * bump(angle_from_top / 0.25)
+    dents = 0.01 * ripples(rng, directions, wavelength=2.0) - 0.04 * bump(angle_from_top / 0.25)
     flattening = rng.uniform(0.9, 0.98)
     peel_color = draw(rng, (0.97, 0.5, 0.06), (0.95, 0.56, 0.08), (0.96, 0.44, 0.07))
     patch_color = draw(rng, (0.98, 0.64, 0.14), (0.9, 0.42, 0.05))
@@ -246,9 +245,8 @@ def lamp(rng: Random) -> Mesh:
     """Create a table lamp with a bulbous foot, a rod, and a shade that is hollow from below."""
     shade_radius = rng.uniform(0.55, 0.7)
     top_radius = rng.uniform(0.25, 0.4)
-    foot_radius = rng.uniform(0.18, 0.3)
     # Points (radius, height) of the four sections of the profile.
-    bulb = arc((0, -0.55), (foot_radius, 0.36), -75, 75)
+    bulb = arc((0, -0.55), (rng.uniform(0.18, 0.3), 0.36), -75, 75)
     foot = np.concatenate([[(0, -1), (0.34, -1), (0.34, -0.93)], bulb])
     rod = [(0.05, -0.15), (0.05, 0.9)]
     lining = [(top_radius - 0.03, 0.9), (shade_radius - 0.03, 0)]

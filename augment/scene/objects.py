@@ -105,8 +105,7 @@ class SceneObject:
     @property
     def ends(self) -> np.ndarray:
         """Return the number of faces up to the end of each object, shape (O,)."""
-        counts = [int(self.own_faces.sum()), *(len(mesh.faces) for _, mesh in self.others)]
-        return np.cumsum(counts)
+        return np.cumsum([int(self.own_faces.sum()), *(len(mesh.faces) for _, mesh in self.others)])
 
     @property
     def own_vertices(self) -> np.ndarray:

@@ -270,8 +270,7 @@ def project_along_light(
     points[mesh_pixels] = starts[mesh_pixels] + length[:, None] * forward[mesh_pixels]
     # Axes of the pattern, to the right and down, perpendicular to the rays of the projector. If the
     # rays are vertical, the small number keeps the vector from being zero.
-    right = torch.stack([-towards[1], towards[0] + 1e-9, towards.new_zeros(())])
-    right = F.normalize(right, dim=0)
+    right = F.normalize(torch.stack([-towards[1], towards[0] + 1e-9, towards.new_zeros(())]), dim=0)
     axes = torch.stack([right, torch.linalg.cross(right, towards)])
     return (points @ axes.T / (camera.width / 2)).T.unflatten(1, image.shape)
 
