@@ -390,8 +390,7 @@ class PerspectiveCamera(Camera):
         y = (up + field("up")) * scale * field("pixel_aspect") + field("principal_up")
         _, near, far = cameras[0]._limits(cameras, depths)
         # The near plane is measured along the axis from the pivot to the camera.
-        depth_scale = 2 * far / (far - near)
-        normalized_depth = depth_scale * ((distance - near - back) / depths) - 1
+        normalized_depth = 2 * far / (far - near) * ((distance - near - back) / depths) - 1
         return _stack([x, y, normalized_depth], 1).swapaxes(1, 2)
 
     def depths(self, points: Points) -> Points:
@@ -524,8 +523,7 @@ def orbit_cameras(
     3.732
     """
     errors.require_whole("views", views, 1, MAX_VIEWS)
-    names = ("width", "polar", "azimuth")
-    width, polar, azimuth = map(_as_scalar, names, (width, polar, azimuth))
+    width, polar, azimuth = map(_as_scalar, ("width", "polar", "azimuth"), (width, polar, azimuth))
     errors.require_range("azimuth", azimuth, -MAX_TURN, MAX_TURN)
     azimuths = [azimuth + 360 * view / views for view in range(views)]
     if fov is None:

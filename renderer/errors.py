@@ -290,10 +290,9 @@ def _as_numbers(value: object) -> np.ndarray | None:
     # NumPy also has larger numbers than those of 8 bytes, which torch cannot read.
     if array.dtype.kind == "f" and array.dtype.itemsize > 8:
         array = array.astype(np.float64)
-    native_dtype = array.dtype.newbyteorder("=")
     # `reshape` is needed because ascontiguousarray
     # changes the shape () to (1,).
-    return np.ascontiguousarray(array, dtype=native_dtype).reshape(array.shape)
+    return np.ascontiguousarray(array, array.dtype.newbyteorder("=")).reshape(array.shape)
 
 
 def as_array(name: str, value: object, kinds: str = _NUMBERS) -> np.ndarray:
@@ -410,8 +409,7 @@ def describe(value: Any) -> str:
     # Unlike an array, a number of NumPy has no method `__setitem__`.
     if not hasattr(value, "__setitem__"):
         return _short_repr(value)
-    is_tensor = type(value).__module__.partition(".")[0] == "torch"
-    noun = "a tensor" if is_tensor else "an array"
+    noun = "a tensor" if type(value).__module__.partition(".")[0] == "torch" else "an array"
     return f"{noun} of {value.dtype} and shape {tuple(value.shape)}"
 
 

@@ -508,8 +508,7 @@ def _framed(camera: Camera, mesh: Mesh, mask: Float[Tensor, "size size"]) -> Cam
     # A camera that is wider by this factor shows the mesh smaller by this factor.
     factor = math.sqrt(np.prod(mesh_high - mesh_low) / np.prod(mask_high - mask_low))
     wider = camera.widened(factor)
-    mask_center = (mask_low + mask_high) / 2
     # Offset of the center of the box from its place in the image of the wider camera.
-    shift = mask_center - (mesh_low + mesh_high) / 2 / factor
+    shift = (mask_low + mask_high) / 2 - (mesh_low + mesh_high) / 2 / factor
     right, up = shift * wider.width / 2
     return replace(wider, right=right, up=up)

@@ -121,8 +121,7 @@ class _Clamp(torch.autograd.Function):
         # 1.0 for values that clamping did not change, and 0.0
         # for other values. A product with booleans would be
         # several times slower than a product with numbers.
-        unclamped_mask = torch.eq(values, clamped, out=torch.empty_like(values))
-        ctx.save_for_backward(unclamped_mask)
+        ctx.save_for_backward(torch.eq(values, clamped, out=torch.empty_like(values)))
         return clamped
 
     @staticmethod
@@ -188,8 +187,7 @@ def require_unit_range(images: Float[Tensor, " ..."]) -> None:
     low, high = images.detach().aminmax()
     advice = "use RGB in [0, 1], without normalization (divide bytes by 255)"
     fault = f"images has values from {{:g}} to {{:g}}: {advice}".format
-    is_in_range = (low >= -OVERSHOOT) & (high <= 1 + OVERSHOOT)
-    require(is_in_range, lambda: InputError(fault(low, high)))
+    require((low >= -OVERSHOOT) & (high <= 1 + OVERSHOOT), lambda: InputError(fault(low, high)))
 
 
 def to_unit(images: UInt8[Tensor, "*shape"]) -> Float32[Tensor, "*shape"]:

@@ -282,8 +282,7 @@ class Mesh:
         # Six times the volume of the tetrahedron of each face and the mesh center, shape (F,). It
         # is negative if the face is turned toward the center.
         sixfold_volumes = np.einsum("fi,fi->f", first_corners, doubled_vectors)
-        volume_of_part = np.bincount(part_of_face, sixfold_volumes)
-        return bool((volume_of_part > 0).all())
+        return bool((np.bincount(part_of_face, sixfold_volumes) > 0).all())
 
 
 # The result for the last mesh is cached. The next mesh often has the same
@@ -337,8 +336,7 @@ def concatenate(meshes: Sequence[Mesh]) -> Mesh:
         # A mesh without gloss textures has a factor of 1 for each of its textures.
         neutral = (_NEUTRAL_GLOSS,) * len(mesh.textures)
         for pair in zip(mesh.textures, mesh.gloss_textures or neutral, strict=True):
-            key = (id(pair[0]), id(pair[1]))
-            number, *_ = pairs.setdefault(key, (len(pairs), *pair))
+            number, *_ = pairs.setdefault((id(pair[0]), id(pair[1])), (len(pairs), *pair))
             new_ids.insert(-1, number)
         texture_ids.append(np.array(new_ids, dtype=np.int32)[mesh.texture_ids])
     has_factors = any(mesh.gloss_textures for mesh in meshes)

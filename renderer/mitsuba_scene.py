@@ -110,8 +110,7 @@ def load(module: Any, scene: Mapping[str, Any]) -> Any:
         if isinstance(value, dict) and value["type"] != "rgb":
             converted[name] = load(module, value)
         elif isinstance(value, np.ndarray):
-            is_transform = value.shape == (4, 4)
-            convert = module.ScalarTransform4f if is_transform else module.Bitmap
+            convert = module.ScalarTransform4f if value.shape == (4, 4) else module.Bitmap
             converted[name] = convert(value)
     return module.load_dict(converted)
 
@@ -224,8 +223,7 @@ def shape(
     # The texture coordinate v = 0 is the upper edge of a
     # texture in Mitsuba, and the lower edge in our meshes.
     texcoords = None if uvs is None else uvs * [1, -1] + [0, 1]
-    values_by_name = {"positions": positions, "normals": normals, "texcoords": texcoords}
-    for name, values in values_by_name.items():
+    for name, values in (("positions", positions), ("normals", normals), ("texcoords", texcoords)):
         if values is not None:
             buffers[f"vertex_{name}"] = values.astype(np.float32).ravel()
     buffers.update()

@@ -315,8 +315,7 @@ def _groups_of_file(
 
 def _are_similar(unit_normals: np.ndarray, pairs: np.ndarray, angle: float) -> np.ndarray:
     """Tell for which pairs of indices (2, N) the normals differ by at most an angle in degrees."""
-    cosines = np.einsum("ni,ni->n", *unit_normals[pairs])
-    return cosines >= np.cos(np.radians(angle))
+    return np.einsum("ni,ni->n", *unit_normals[pairs]) >= np.cos(np.radians(angle))
 
 
 def _neighbors(faces: np.ndarray) -> Int[np.ndarray, "2 N"]:
@@ -361,5 +360,4 @@ def _cancels(groups: np.ndarray, area_vectors: np.ndarray, lengths: np.ndarray) 
     flat_groups = groups.ravel()
     sums = [np.bincount(flat_groups, component.repeat(3)) for component in area_vectors.T]
     length_sums = np.bincount(flat_groups, lengths.repeat(3))
-    is_canceled = np.linalg.norm(sums, axis=0) <= CANCELLATION * length_sums
-    return is_canceled[groups]
+    return (np.linalg.norm(sums, axis=0) <= CANCELLATION * length_sums)[groups]

@@ -79,8 +79,7 @@ def orange(rng: Random) -> Mesh:
     directions, faces = sphere()
     angle_from_top = np.arccos(np.clip(directions[:, 2], -1, 1))
     pores = ripples(rng, directions, wavelength=0.2)
-    waves = ripples(rng, directions, wavelength=2.0)
-    dents = 0.01 * waves - 0.04 * bump(angle_from_top / 0.25)
+    dents = 0.01 * ripples(rng, directions, wavelength=2.0) - 0.04 * bump(angle_from_top / 0.25)
     flattening = rng.uniform(0.9, 0.98)
     peel_color = draw(rng, (0.97, 0.5, 0.06), (0.95, 0.56, 0.08), (0.96, 0.44, 0.07))
     patch_color = draw(rng, (0.98, 0.64, 0.14), (0.9, 0.42, 0.05))
@@ -120,12 +119,10 @@ def pear(rng: Random) -> Mesh:
     """Create a pear with a neck and a stalk, freckled in yellow to green."""
     latitude = np.linspace(-np.pi / 2, 0.49 * np.pi, 40)
     belly_radius = rng.uniform(0.46, 0.5)
-    narrowing = rng.uniform(0.15, 0.19)
-    width = belly_radius - narrowing * np.tanh(4 * np.sin(latitude) - 1.2)
+    width = belly_radius - rng.uniform(0.15, 0.19) * np.tanh(4 * np.sin(latitude) - 1.2)
     radius = width * np.cos(latitude)
-    height = 0.88 * np.sin(latitude) - 0.12
     # Points (radius, height) of the profile of the fruit and of its stalk.
-    flesh = np.stack([radius, height], axis=1)
+    flesh = np.stack([radius, 0.88 * np.sin(latitude) - 0.12], axis=1)
     stalk = [(0.03, 0.97), (0, 0.97)]
     vertices, faces, section = revolve(flesh, stalk)
     skin_color = draw(rng, (0.78, 0.78, 0.27), (0.6, 0.68, 0.22))
@@ -248,9 +245,8 @@ def lamp(rng: Random) -> Mesh:
     """Create a table lamp with a bulbous foot, a rod, and a shade that is hollow from below."""
     shade_radius = rng.uniform(0.55, 0.7)
     top_radius = rng.uniform(0.25, 0.4)
-    foot_radius = rng.uniform(0.18, 0.3)
     # Points (radius, height) of the four sections of the profile.
-    bulb = arc((0, -0.55), (foot_radius, 0.36), -75, 75)
+    bulb = arc((0, -0.55), (rng.uniform(0.18, 0.3), 0.36), -75, 75)
     foot = np.concatenate([[(0, -1), (0.34, -1), (0.34, -0.93)], bulb])
     rod = [(0.05, -0.15), (0.05, 0.9)]
     lining = [(top_radius - 0.03, 0.9), (shade_radius - 0.03, 0)]
@@ -463,13 +459,11 @@ def surface_of_cells(is_filled: Bool[np.ndarray, "X Y Z"]) -> tuple[np.ndarray, 
         for toward, side in ((1, square[::-1]), (-1, unit_vectors[axis] + square)):
             is_neighbor_filled = np.roll(padded, toward, axis)[1:-1, 1:-1, 1:-1]
             # A filled cell next to an empty cell has a side on the surface.
-            cells = np.argwhere(is_filled & ~is_neighbor_filled)
-            squares.append(cells[:, None] + side)
+            squares.append(np.argwhere(is_filled & ~is_neighbor_filled)[:, None] + side)
     corners = np.concatenate(squares).reshape(-1, 3)
     vertices, corner_to_vertex = np.unique(corners, axis=0, return_inverse=True)
-    square_vertices = corner_to_vertex.reshape(-1, 4)
     # Each square with the corners 0 to 3 becomes two triangles.
-    triangles = square_vertices[:, [[0, 1, 2], [0, 2, 3]]]
+    triangles = corner_to_vertex.reshape(-1, 4)[:, [[0, 1, 2], [0, 2, 3]]]
     return vertices, triangles.reshape(-1, 3)
 
 

@@ -201,8 +201,7 @@ def _nearest_in_box_and_sphere(values: Rows, low: Any, high: Any, ball: Ball) ->
         # Clamped values do not change with the factor.
         slope = _squared_norm(offset * (nearest == target))
         squared_distance = _squared_norm(nearest - ball.center)
-        is_inside = squared_radius - squared_distance > rounding
-        is_too_short = (squared_factor < 1) & is_inside
+        is_too_short = (squared_factor < 1) & (squared_radius - squared_distance > rounding)
         # A GPU takes all steps, so that the CPU need not wait for it.
         if values.device.type == "cpu" and not is_too_short.any():
             break

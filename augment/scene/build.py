@@ -369,8 +369,7 @@ def _reached_roughness(
         lowest_mean = max(mean - radius * material.roughness, MIN_ROUGHNESS)
         roughness = (roughness + min(lowest_mean - mean, 0.0)).clamp(min=0)
     # `Gloss` gets its default specular factor of 1, because attacks and variations can reach 1.
-    gloss = Gloss(roughness, textured=layer is None)
-    return smallest_roughness(gloss.on(item.own_mesh))
+    return smallest_roughness(Gloss(roughness, textured=layer is None).on(item.own_mesh))
 
 
 def degree_of_scene(smoothest: Smoothest, given: int | None, pixels: int) -> int:

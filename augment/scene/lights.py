@@ -173,8 +173,7 @@ class ProjectedSlide(LightModel):
 
     def __post_init__(self) -> None:
         if self.slides is not None:
-            slides = patterns.as_photographs("slides", self.slides)
-            object.__setattr__(self, "slides", slides)
+            object.__setattr__(self, "slides", patterns.as_photographs("slides", self.slides))
 
     def light(self, drawn: Drawn) -> Illumination:
         """Project a picture of its own on each image."""

@@ -105,8 +105,7 @@ class SceneObject:
     @property
     def ends(self) -> np.ndarray:
         """Return the number of faces up to the end of each object, shape (O,)."""
-        counts = [int(self.own_faces.sum()), *(len(mesh.faces) for _, mesh in self.others)]
-        return np.cumsum(counts)
+        return np.cumsum([int(self.own_faces.sum()), *(len(mesh.faces) for _, mesh in self.others)])
 
     @property
     def own_vertices(self) -> np.ndarray:
@@ -114,8 +113,7 @@ class SceneObject:
 
         The other vertices belong to faces of other objects or of a table.
         """
-        corners_of_others = self.mesh.faces[~self.own_faces]
-        return ~np.isin(np.arange(len(self.mesh.vertices)), corners_of_others)
+        return ~np.isin(np.arange(len(self.mesh.vertices)), self.mesh.faces[~self.own_faces])
 
     @property
     def own_mesh(self) -> Mesh:

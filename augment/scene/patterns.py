@@ -68,15 +68,13 @@ def stripes(
 def checkers(points: Points, shift: Points) -> Bool[Tensor, " ..."]:
     """Find the points on the bright squares of a chessboard with period 1."""
     # A square is bright if exactly one of x and y is in the first half of its period.
-    is_in_first_half = fraction(points + shift) < 0.5
-    return is_in_first_half.sum(0) == 1
+    return (fraction(points + shift) < 0.5).sum(0) == 1
 
 
 def spots(points: Points, shift: Points) -> Bool[Tensor, " ..."]:
     """Find the points in the discs of a square grid with period 1."""
-    # Vector from the center of the disc in the same cell to each point, shape (2, ...).
-    from_center = fraction(points + shift) - 0.5
-    return from_center.square().sum(0) < DISC_RADIUS**2
+    # The difference is the vector from the center of the disc in the same cell, shape (2, ...).
+    return (fraction(points + shift) - 0.5).square().sum(0) < DISC_RADIUS**2
 
 
 def half(points: Points, shift: Tensor | float) -> Bool[Tensor, " ..."]:
@@ -169,8 +167,7 @@ def planckian_rgb(kelvin: Tensor, offset: Tensor | float = 0.0) -> Float[Tensor,
     u, v = u + shift * along_v, v - shift * along_u
     # CIE 1960 (u, v) to X and Z at Y = 1: X / Y = 3u / 2v and Z / Y = (4 − u − 10v) / 2v.
     xyz = torch.cat([3 * u, 2 * v, 4 - u - 10 * v], -3) / (2 * v)
-    to_rgb = xyz.new_tensor(XYZ_TO_RGB)
-    return (to_rgb @ xyz[..., 0, 0, None])[..., None].clamp(min=1e-3)
+    return (xyz.new_tensor(XYZ_TO_RGB) @ xyz[..., 0, 0, None])[..., None].clamp(min=1e-3)
 
 
 def draw_patterns(
@@ -236,8 +233,7 @@ def draw_photograph_patterns(
     # Three numbers in [0, 1] of each photograph, shape (N, 1, 1) each.
     turn, zoom, relative_saturation = torch.rand(3, len(photographs), 1, 1, generator=draws)
     angle = 2 * math.pi * turn
-    scale = MAX_ZOOM ** (2 * zoom - 1)
-    rotated = turned(points * scale, angle.cos(), angle.sin())
+    rotated = turned(points * MAX_ZOOM ** (2 * zoom - 1), angle.cos(), angle.sin())
     # `grid_sample` needs x and y on the last axis.
     height, width = photographs.shape[-2:]
     grid = rotated.permute(1, 2, 3, 0) * rotated.new_tensor([1, width / height])
@@ -246,14 +242,12 @@ def draw_photograph_patterns(
     )
     # Change the saturation: scale the difference between each color and its gray value.
     gray = luminance(shown)
-    factor = MAX_SATURATION * relative_saturation[:, None]
-    return (gray + factor * (shown - gray)).clamp(0, 1)
+    return (gray + MAX_SATURATION * relative_saturation[:, None] * (shown - gray)).clamp(0, 1)
 
 
 def luminance(linear: Float[Tensor, "N 3 H W"]) -> Float[Tensor, "N 1 H W"]:
     """Compute the luminance of each pixel."""
-    weights = linear.new_tensor(LUMINANCE)[:, None, None]
-    return (linear * weights).sum(1, keepdim=True)
+    return (linear * linear.new_tensor(LUMINANCE)[:, None, None]).sum(1, keepdim=True)
 
 
 # Smallest and largest number of Voronoi cells of a slide.
@@ -472,9 +466,8 @@ def _window(points: Points, rng: np.random.Generator) -> Tensor:
     """Draw the light that falls through the panes of a window into a dark room."""
     pane_counts = _pair(rng.integers(2, 5, 2))
     pane_size = _pair(rng.uniform(0.15, 0.4, 2))
-    center = _pair(rng.uniform(-0.15, 0.15, 2))
     # The position (0, 0) is a corner of the window. A pane has the size 1.
-    positions = (points - center) / pane_size + pane_counts / 2
+    positions = (points - _pair(rng.uniform(-0.15, 0.15, 2))) / pane_size + pane_counts / 2
     is_in_window = (positions > 0) & (positions < pane_counts)
     is_in_pane = (positions % 1 - 0.5).abs() < rng.uniform(0.3, 0.45)
     return (is_in_window & is_in_pane).all(dim=0)
@@ -507,8 +500,7 @@ def _text(points: Points, rng: np.random.Generator) -> Tensor:
         # its first letter.
         left = -int(rng.integers(letter_height))
         ImageDraw.Draw(image).text((left, top), line, 255, font)
-    weights = np.asarray(image, dtype=np.float32)[..., None] / 255
-    return _interpolate(weights, points, order=1)
+    return _interpolate(np.asarray(image, dtype=np.float32)[..., None] / 255, points, order=1)
 
 
 def _colors(points: Points, rng: np.random.Generator) -> Float[Tensor, "3 H W"]:
@@ -595,5 +587,4 @@ def draw_lab_color(rng: np.random.Generator) -> Float[np.ndarray, " 3"]:
 
     It is linear RGB, and its largest channel is 1.
     """
-    hue_and_saturation = torch.from_numpy(rng.uniform(size=(1, 2)))
-    return random_colors(hue_and_saturation).flatten().numpy()
+    return random_colors(torch.from_numpy(rng.uniform(size=(1, 2)))).flatten().numpy()

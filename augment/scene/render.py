@@ -158,8 +158,7 @@ class OperatorRenderer:
                 stack_bytes = sum(tensor.nbytes for tensor in tensors)
                 needed = int(self._stack_of_image.max()) * stack_bytes + self.attack_bytes
                 height, width = self.settings.shape
-                count = len(self._views_of_operators)
-                name = f"{count} views of {height} × {width} pixels (views)"
+                name = f"{len(self._views_of_operators)} views of {height} × {width} pixels (views)"
                 require_memory(name, needed, self.backgrounds.device)
 
     def _build_stack(self, index: int) -> _BuiltStack:
@@ -182,8 +181,7 @@ class OperatorRenderer:
         background_terms = background_term(coverage, backgrounds, self.settings.encoding)
         # Number the images of the stack in their order: 0 for the first True of the mask, and so
         # on.
-        image_to_stack_image = is_in_stack.cumsum(0) - 1
-        return _BuiltStack(stack, image_to_stack_image, background_terms)
+        return _BuiltStack(stack, is_in_stack.cumsum(0) - 1, background_terms)
 
 
 # Largest number of samples of the rasterized views that are kept, which take about a gigabyte.
@@ -303,8 +301,7 @@ def _sum_by_pixel(fragments: Fragments, albedo: Float[Tensor, "S 3"]) -> Float[T
     """Sum the albedo of the samples in each pixel of an image."""
     # Row-major index of the pixel in which each sample lies, shape (S,).
     pixel_of_sample = fragments.pixels[fragments.sample_to_pixel]
-    sums = albedo.new_zeros(3, math.prod(fragments.shape))
-    return sums.index_add(1, pixel_of_sample, albedo.T)
+    return albedo.new_zeros(3, math.prod(fragments.shape)).index_add(1, pixel_of_sample, albedo.T)
 
 
 @dataclass(eq=False, repr=False)
@@ -428,8 +425,7 @@ class DirectRenderer:
         normals = normalize(normals, dim=1) * fragments.facing[seen_face]
         # Depth and the three components of the normal, shape (4, P).
         at_pixels = torch.cat([depth[None], normals.T])
-        samples = len(cameras) * self.settings.pixel_count
-        maps = torch.zeros(4, samples, dtype=torch.float32)
+        maps = torch.zeros(4, len(cameras) * self.settings.pixel_count, dtype=torch.float32)
         is_covered = fragments.coverage >= COVERED
         maps[:, fragments.pixels[is_covered]] = at_pixels[:, is_covered].float()
         return maps.view(4, -1, *self.settings.shape).transpose(0, 1)
@@ -473,9 +469,7 @@ class DirectRenderer:
         if changed.albedo is not None:
             of_view = (item.mesh, fragments, settings.encoding, item.albedo_scale)
             albedo = paint_faces(*of_view, changed.albedo, changed.hue)
-        gloss = None
-        if changed.gloss is not None:
-            gloss = Gloss(*changed.gloss.unbind(1), textured=True)
+        gloss = None if changed.gloss is None else Gloss(*changed.gloss.unbind(1), textured=True)
         split = split_light(self.basis, changed.light)
         # Projector and lamps need rays for their shadows. For an unmoved object with its own
         # gloss, the view is prepared once.

@@ -401,9 +401,8 @@ class Scene:
         items = [self.objects[self.examples[example].object] for example in rows.tolist()]
         # Indices among the objects of each example of those in the truth.
         kept = [[0, *(i for i, of in enumerate(item.labels) if i and of != "")] for item in items]
-        # Largest number of objects in an example. Examples with fewer are padded with NO_OBJECT.
-        most = max(map(len, kept))
-        labels = torch.full((len(rows), self.views, most), NO_OBJECT)
+        # Examples with fewer objects than the one with most are padded with NO_OBJECT.
+        labels = torch.full((len(rows), self.views, max(map(len, kept))), NO_OBJECT)
         size, device = self.settings.shape, self.lights.device
         masks = torch.zeros((*labels.shape, *size), dtype=torch.bool, device=device)
         visible = torch.zeros(labels.shape, device=device)
@@ -432,11 +431,9 @@ class Scene:
         self, conditions: Conditions, examples: Int[Tensor, " A"]
     ) -> Float[Tensor, "A V 4 height width"]:
         """Return the depth and the three components of normals in the views of examples."""
-        shape = (len(examples), self.views, 4, *self.settings.shape)
-        maps = torch.zeros(shape, dtype=torch.float32)
+        maps = torch.zeros(len(examples), self.views, 4, *self.settings.shape, dtype=torch.float32)
         for group in self._groups(conditions, examples.tolist()):
-            of_views = self._direct_renderer.surface_maps(group)
-            maps[list(group.rows), list(group.views)] = of_views
+            maps[list(group.rows), list(group.views)] = self._direct_renderer.surface_maps(group)
         return maps
 
     def _as_examples(self, examples: object, count: int | None = None) -> Int[Tensor, " A"]:

@@ -176,8 +176,7 @@ def surface_of_depth(depth: Float[Tensor, "B 1 H W"]) -> Surface:
     spacing = 2 * tangent / depth.shape[-1]
     down, right = (_slope(relative.log(), spacing, axis) for axis in (2, 3))
     # Product of both tangents of the surface z · (x, y, 1), up to a factor.
-    towards = 1 + tangent * (x * right + y * down)
-    towards = towards.clamp(min=0.05)
+    towards = (1 + tangent * (x * right + y * down)).clamp(min=0.05)
     height = (1 - relative) / tangent
     return Surface(-down / towards, -right / towards, (x * relative, y * relative, height))
 

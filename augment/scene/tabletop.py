@@ -253,8 +253,7 @@ def project_along_light(
     of the width that the camera sees. `towards` is the unit vector towards the projector.
     """
     # Points of table or wall that the pixels would show without the object, shape (P, 3).
-    centers = replace(image, samples=1)
-    points = _find_seen_points(camera, centers, room, image.shape).points[0]
+    points = _find_seen_points(camera, replace(image, samples=1), room, image.shape).points[0]
     starts = _ray_starts(camera, points)
     forward = F.normalize(points - starts, dim=1)
     face_of_pixel = room.rays.first_hit(starts, forward)
@@ -271,11 +270,9 @@ def project_along_light(
     points[mesh_pixels] = starts[mesh_pixels] + length[:, None] * forward[mesh_pixels]
     # Axes of the pattern, to the right and down, perpendicular to the rays of the projector. If the
     # rays are vertical, the small number keeps the vector from being zero.
-    right = torch.stack([-towards[1], towards[0] + 1e-9, towards.new_zeros(())])
-    right = F.normalize(right, dim=0)
+    right = F.normalize(torch.stack([-towards[1], towards[0] + 1e-9, towards.new_zeros(())]), dim=0)
     axes = torch.stack([right, torch.linalg.cross(right, towards)])
-    coordinates = points @ axes.T / (camera.width / 2)
-    return coordinates.T.unflatten(1, image.shape)
+    return (points @ axes.T / (camera.width / 2)).T.unflatten(1, image.shape)
 
 
 def _passes_near_origin(points: Tensor, directions: Tensor, radius: float) -> Bool[Tensor, " ..."]:

@@ -119,9 +119,8 @@ class _Variation:
         scales = self._draw_log_uniform(settings.scale)
         angles = self._draw_pairs(settings.azimuth)
         # A field of view of 0 leaves the kind and the distance of a camera as they are.
-        fovs = [0.0] * len(shifts)
-        if any(settings.fov):
-            fovs = self._draw_uniform(*settings.fov).tolist()
+        has_fov = any(settings.fov)
+        fovs = self._draw_uniform(*settings.fov).tolist() if has_fov else [0.0] * len(shifts)
         changes = zip(shifts, scales, angles, fovs, self.is_on_table.tolist(), strict=True)
         return [
             replace(example, cameras=tuple(_move(camera, *change) for camera in example.cameras))

@@ -420,8 +420,7 @@ def read_material(file: GltfFile, index: int | None) -> Material:
         return material
     # Roughness, metallic and specular factor.
     factors = [model.get("roughnessFactor", 1), model.get("metallicFactor", 1)]
-    factors = [*factors, _specular_factor(extensions)]
-    material = replace(material, gloss=np.clip(factors, 0.0, 1.0))
+    material = replace(material, gloss=np.clip([*factors, _specular_factor(extensions)], 0.0, 1.0))
     if "metallicRoughnessTexture" not in model:
         return material
     image, placement = _image(file, model["metallicRoughnessTexture"])
@@ -433,8 +432,7 @@ def _specular_factor(extensions: dict[str, Any]) -> float:
     """Compute the specular factor, which is 1 for a reflectance of 4%, by its two extensions."""
     specular = extensions.get(SPECULAR, {})
     colors = np.array(specular.get("specularColorFactor", [1.0] * 3))
-    textures = {"specularTexture", "specularColorTexture"} & specular.keys()
-    if textures or np.ptp(colors) > 0:
+    if {"specularTexture", "specularColorTexture"} & specular.keys() or np.ptp(colors) > 0:
         raise ValueError("a material has a specular color or texture: read it without gloss")
     ior = extensions.get(IOR, {}).get("ior", 1.5)
     # Reflectance at normal incidence (Fresnel) for the index of refraction, 1.5 by default.

@@ -101,8 +101,7 @@ def load_mesh(path: str | Path, up: str = "auto", gloss: bool = False) -> Mesh:
         raise InputError(f"{fault}: export the mesh again")
     if not mesh.face_areas().sum() > 0:
         raise InputError(f"the surface of {path} has the area 0: give faces with an area")
-    is_gltf = READERS[path.suffix.lower()] is read_gltf
-    is_y_up = up == "y" or (up == "auto" and is_gltf)
+    is_y_up = up == "y" or (up == "auto" and READERS[path.suffix.lower()] is read_gltf)
     return transformed(mesh, Y_UP_TO_Z_UP) if is_y_up else mesh
 
 

@@ -103,8 +103,7 @@ def read_obj(file: MeshFile) -> list[Part]:
     corner_uvs = np.append(uvs[:, :2], [[np.nan] * 2], axis=0)[uv_ids]
     texels = [file.texture(*texture) for texture in textures]
     mesh = mesh_file.colored_mesh(vertices, faces, colors, corner_uvs, texture_ids, texels)
-    normals = np.append(normals, [[0.0] * 3], axis=0)
-    return [Part(mesh, normals[normal_ids])]
+    return [Part(mesh, np.append(normals, [[0.0] * 3], axis=0)[normal_ids])]
 
 
 def _cleaned(text: bytes) -> bytes:
@@ -271,8 +270,7 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
                 values: list[float] = []
                 # Words such as "spectral" are no numbers.
                 with suppress(ValueError):
-                    words = mesh_file.without_comments(text.encode()).split()
-                    values = [float(word) for word in words]
+                    values = [*map(float, mesh_file.without_comments(text.encode()).split())]
                 if key == "ke":  # The strength of light has no limit.
                     values = [value / max(1.0, *values) for value in values]
                 is_color = all(0 <= value <= 1 + mesh_file.TOLERANCE for value in values)

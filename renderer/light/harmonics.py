@@ -552,7 +552,6 @@ def rotate(coefficients: Tensor, rotation: Float[Tensor, "3 3"]) -> Tensor:
     def rotated_radiance(directions: Tensor) -> Tensor:
         """Compute the radiance of the rotated light from directions, shape (..., 3)."""
         # Each row is a direction ω. Multiplying the row by R from the right gives Rᵀ ω.
-        turned_back = directions @ rotation.to(directions)
-        return basis(turned_back, degree) @ coefficients.to(directions)
+        return basis(directions @ rotation.to(directions), degree) @ coefficients.to(directions)
 
     return project(rotated_radiance, degree, quadrature_degree=2 * degree).to(coefficients)

@@ -373,8 +373,7 @@ class Lamps(LocalBasis):
         # Successive points of the spiral are apart by the golden angle π (3 - √5).
         angle = point_index * math.pi * (3 - math.sqrt(5)) + set_index * 2 * math.pi / POINT_SETS
         # Positions in the plane of a disc, with the axes: set, point, plane coordinate.
-        in_plane = torch.stack([distance * angle.cos(), distance * angle.sin()], dim=2)
-        in_plane = in_plane.to(positions)
+        in_plane = torch.stack([distance * angle.cos(), distance * angle.sin()], 2).to(positions)
         # Unit vector from the origin to each disc, which is the axis of the disc.
         x, y, z = F.normalize(positions, dim=1).unbind(1)
         # `tangent_axes` would be singular for some discs below the origin without this sign.

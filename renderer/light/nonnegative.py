@@ -492,8 +492,7 @@ def _polynomials(degree: int) -> tuple[Array, Array]:
             exponents += [(a, b, total - a - b) for b in range(total - a, -1, -1)]
         # Monomials of degree `total` only express harmonics whose degree has the same
         # parity (even or odd) as `total`. Set the columns of all others to 0.
-        has_same_parity = (bands(total) - total) % 2 == 0
-        homogeneous = monomial_coefficients(total) * has_same_parity
+        homogeneous = monomial_coefficients(total) * ((bands(total) - total) % 2 == 0)
         coefficients.append(F.pad(homogeneous, (0, (degree + 1) ** 2 - homogeneous.shape[1])))
     return np.array(exponents).T, torch.cat(coefficients).numpy()
 

@@ -75,8 +75,7 @@ def nonnegative_window(degree: int) -> Tensor:
     [0, 1] are equal within a band, and the first is 1.
     """
     # The first harmonic of band l has the index l².
-    first_of_band = np.arange(degree + 1) ** 2
-    irradiance_by_band = irradiance_weights(degree)[first_of_band].numpy()
+    irradiance_by_band = irradiance_weights(degree)[np.arange(degree + 1) ** 2].numpy()
     return best_window(np.ones(degree + 1), irradiance_by_band)
 
 
@@ -161,8 +160,7 @@ def irradiance_weights(degree: int) -> Tensor:
     # Also compute the factor of degree + 1, because it may be the smallest positive factor.
     factors = lambertian_factors(degree + 1).abs()
     smallest = factors[factors > 0].min()
-    weights = factors.clamp(min=smallest / 2) / factors[0]
-    return weights[: (degree + 1) ** 2]
+    return (factors.clamp(min=smallest / 2) / factors[0])[: (degree + 1) ** 2]
 
 
 @cache
@@ -220,8 +218,7 @@ def highlight_window(degree: int, roughness: float, width: float) -> Tensor:
     """
     highlight = _amplitudes(max(roughness, MIN_ROUGHNESS) * math.sqrt(width), degree)
     # The first harmonic of degree l has the index l².
-    first_of_degree = torch.arange(degree + 1) ** 2
-    irradiance = lambertian_factors(degree)[first_of_degree].numpy() / math.pi
+    irradiance = lambertian_factors(degree)[torch.arange(degree + 1) ** 2].numpy() / math.pi
     # The squared errors of the highlight and of the irradiance add up, so the squared weights do,
     # too.
     return best_window(highlight, np.hypot(highlight, IRRADIANCE_WEIGHT * irradiance))
@@ -236,20 +233,17 @@ def _amplitudes(roughness: float, degree: int) -> Float[np.ndarray, " degrees"]:
     """
     # The camera looks along the normal, so the result depends only on the angle of the light.
     normal = torch.tensor([[0.0, 0.0, 1.0]], dtype=torch.float64)
-    # Polynomials of higher degrees oscillate faster and need more nodes.
-    node_count = 2**9 + 4 * degree
-    # Gauss-Legendre nodes in [-1, 1]. They are mapped to the cosines of angles to the
-    # normal in [0, 1], because the lobe is 0 below the surface.
-    nodes, weights = legendre.leggauss(node_count)
+    # Gauss-Legendre nodes in [-1, 1], more for higher degrees, whose polynomials oscillate faster.
+    # They are mapped to the cosines of angles to the normal in [0, 1], because the lobe is 0 below
+    # the surface.
+    nodes, weights = legendre.leggauss(2**9 + 4 * degree)
     cosine = torch.from_numpy((nodes + 1) / 2)
-    sine = (1 - cosine**2).sqrt()
     # Directions to the light, one for each node, in the plane y = 0.
-    light = torch.stack([sine, 0 * cosine, cosine], 1)
+    light = torch.stack([(1 - cosine**2).sqrt(), 0 * cosine, cosine], 1)
     roughness_tensor = torch.tensor(roughness, dtype=torch.float64)
     # SCHLICK is the term of the reflectance that is multiplied by the color of a metal. The cosine
     # converts the radiance of the light to irradiance.
     lobe = reflectance(normal, normal, light, roughness_tensor)[SCHLICK] * cosine
     # Legendre polynomials P_0 to P_degree (columns) at each node (rows).
-    polynomials = legendre.legvander(cosine.numpy(), degree)
-    amplitudes = (weights * lobe.numpy()) @ polynomials
+    amplitudes = (weights * lobe.numpy()) @ legendre.legvander(cosine.numpy(), degree)
     return np.maximum(amplitudes / amplitudes[0], MIN_AMPLITUDE)

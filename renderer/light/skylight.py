@@ -164,8 +164,7 @@ def _as_parameters(
     for name, value in parameters.items():
         # `as_tensor` raises InputError if the value is no tensor, but rounds Python numbers.
         as_tensor(name, value)
-        is_floating = any(value is tensor for tensor in floating)
-        dtype = None if is_floating else torch.float64
+        dtype = None if any(value is tensor for tensor in floating) else torch.float64
         tensors[name] = torch.as_tensor(value, dtype=dtype, device=like.device)
     require_finite(azimuth=tensors["azimuth"])
     ranges = {

@@ -305,5 +305,4 @@ def _sum_by_pixel(
     sample_to_pixel: Int[Tensor, " S"], pixel_count: int, rows: Float[Tensor, "S K"]
 ) -> Float[Tensor, "K P"]:
     """Add up values over the samples of each pixel."""
-    zeros = rows.new_zeros(pixel_count, rows.shape[1])
-    return zeros.index_add_(0, sample_to_pixel, rows).T
+    return rows.new_zeros(pixel_count, rows.shape[1]).index_add_(0, sample_to_pixel, rows).T

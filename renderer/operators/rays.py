@@ -305,11 +305,9 @@ class Rays:
         blocks = plane_normals.split(max(1, 8 * BLOCK // len(hull_vertices)))
         # Largest coordinate of a hull vertex along the normal of each seen face.
         highest = torch.cat([(block @ hull_vertices.T).amax(1) for block in blocks])
-        first_corner = surface.vertices[fragments.corners[:, 0]]
         # Height of the face itself along its normal.
-        height_of_face = (plane_normals * first_corner).sum(1)
-        cosine_of_normals = (surface.normals * surface.planes).sum(1)
-        blocks_light = cosine_of_normals < 1 - 2 * MAX_IGNORED_LIGHT
+        height_of_face = (plane_normals * surface.vertices[fragments.corners[:, 0]]).sum(1)
+        blocks_light = (surface.normals * surface.planes).sum(1) < 1 - 2 * MAX_IGNORED_LIGHT
         may_hit = (highest - height_of_face > self.offset)[fragments.sample_to_seen_face]
         return fragments.sample_to_pixel[may_hit | blocks_light].unique(), may_hit
 
@@ -368,11 +366,9 @@ def local_transfer(
     weights = weights / fragments.samples**2
     # The paths of a pixel that come from the same basis function are added up to one entry.
     # Pixel and function are combined to one number, because sorting numbers is faster.
-    pixel_of_path = fragments.sample_to_pixel[paths.point]
-    key_of_path = pixel_of_path * basis.size + paths.function
+    key_of_path = fragments.sample_to_pixel[paths.point] * basis.size + paths.function
     keys, path_to_entry = key_of_path.unique(return_inverse=True)
-    zeros = weights.new_zeros(len(keys), albedo.shape[1])
-    weight = zeros.index_add_(0, path_to_entry, weights)
+    weight = weights.new_zeros(len(keys), albedo.shape[1]).index_add_(0, path_to_entry, weights)
     return SparseTransfer(function=keys % basis.size, pixel=keys // basis.size, weight=weight)
 
 
@@ -490,5 +486,4 @@ class LocalLightView:
         radiance = path_reflectance(surface, albedo.cpu().double(), paths) / shown.samples**2
         radiance = radiance * irradiance
         zeros = radiance.new_zeros(len(shown.pixels), 3)
-        pixel_of_path = shown.sample_to_pixel[paths.point]
-        return zeros.index_add(0, pixel_of_path, radiance).T.to(light)
+        return zeros.index_add(0, shown.sample_to_pixel[paths.point], radiance).T.to(light)

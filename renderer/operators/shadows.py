@@ -384,8 +384,7 @@ def _radiosity(
     sent = from_sky * reflectance
     for _ in range(settings.bounces - 1):
         # Irradiance from other patches. Axes: patch that sees others, SH coefficient, color.
-        from_patches = torch.from_numpy(factors @ sent.flatten(1).numpy())
-        from_patches = from_patches.view(-1, *sent.shape[1:])
+        from_patches = torch.from_numpy(factors @ sent.flatten(1).numpy()).view(-1, *sent.shape[1:])
         sent = from_sky.expand_as(sent).index_add(0, receiving, from_patches) * reflectance
     return sent
 

@@ -360,8 +360,7 @@ def with_added_albedo(
         charts = _Charts(mesh.corner_uvs[faces], texture.shape[1::-1])
         new_texture = np.zeros((*charts.sheet_size[::-1], 3), np.uint8)
         new_gloss = np.zeros((*charts.sheet_size[::-1], gloss.shape[2]), np.uint8)
-        block_count = 1 + charts.texel_count // SHEET_BLOCK
-        for block in np.array_split(np.arange(len(faces)), block_count):
+        for block in np.array_split(np.arange(len(faces)), 1 + charts.texel_count // SHEET_BLOCK):
             chart, on_sheet, center = charts.texels(block)
             bytes_of_texels = torch.from_numpy(_texels_at(center, texture)).long()
             albedo = albedo_of_byte.take(bytes_of_texels)

@@ -288,8 +288,7 @@ def smallest_roughness(mesh: Mesh) -> float:
     factor_of_face = np.take([*smallest, 1.0], mesh.texture_ids if smallest else -1)
     roughness_of_face = mesh.gloss[:, 0] * factor_of_face
     # Columns 1 and 2 are metallic and specular factor. If both are 0, a face is matte.
-    has_gloss = mesh.gloss[:, 1:].any(1)
-    return float(roughness_of_face.min(initial=1, where=has_gloss))
+    return float(roughness_of_face.min(initial=1, where=mesh.gloss[:, 1:].any(1)))
 
 
 def at_samples(values: Tensor, samples: Tensor | slice) -> Tensor:
@@ -312,8 +311,7 @@ def sample_gloss(mesh: Mesh, fragments: Fragments, gloss: Gloss | None) -> Sampl
     if gloss is None:
         if mesh.gloss is None:
             return None
-        has_one_gloss = (mesh.gloss == mesh.gloss[0]).all()
-        rows = mesh.gloss[:1] if has_one_gloss else mesh.gloss
+        rows = mesh.gloss[:1] if (mesh.gloss == mesh.gloss[0]).all() else mesh.gloss
         gloss = Gloss(*torch.from_numpy(rows).unbind(1))
     columns = [values.to(fragments.coverage) for values in gloss.checked(len(mesh.faces))]
     # A single value, which all faces share, stays as it is.

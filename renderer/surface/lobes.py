@@ -343,8 +343,7 @@ def _chebyshev(argument: Tensor, count: int) -> Tensor:
 
 def _nodes_and_interpolation(count: int) -> tuple[Tensor, Tensor]:
     """Return the zeros of T_count, and the matrix from values there to coefficients."""
-    steps = torch.arange(count, dtype=torch.float64) + 0.5
-    nodes = (math.pi * steps / count).cos()
+    nodes = (math.pi * (torch.arange(count, dtype=torch.float64) + 0.5) / count).cos()
     return nodes, torch.linalg.inv(_chebyshev(nodes, count).T)
 
 

@@ -347,9 +347,8 @@ def _gradient_of_light(degree: int, dtype: torch.dtype, device: torch.device) ->
     monomials + 1, coefficients). The last row gives a, and the others ∇p.
     """
     even_degree = _even_degree(degree)
-    coefficient_count = (even_degree + 1) ** 2
     # Gradients of the 4 harmonics up to degree 1, and zeros for all other harmonics.
-    linear_gradients = F.pad(_gradients(1), (0, coefficient_count - 4))
+    linear_gradients = F.pad(_gradients(1), (0, (even_degree + 1) ** 2 - 4))
     # Axes: component of the gradient, monomial (the constant 1 last), harmonic.
     gradients = torch.cat([_gradients(even_degree), linear_gradients], dim=1)
     irradiance_gradients = gradients * harmonics.lambertian_factors(even_degree)
@@ -377,8 +376,7 @@ def _gradients(degree: int) -> Tensor:
     in_harmonics = harmonics.homogeneous_gradients(degree)[:, : degree**2]
     # The same gradients as sums of monomials.
     in_monomials = harmonics.monomial_coefficients(degree - 1) @ in_harmonics
-    has_same_parity = band % 2 == degree % 2
-    return in_monomials * ((band > 0) & has_same_parity)
+    return in_monomials * ((band > 0) & (band % 2 == degree % 2))
 
 
 def normals_in_sight(

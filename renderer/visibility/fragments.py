@@ -260,8 +260,7 @@ class Fragments:
         together. The result is differentiable.
         """
         zeros = albedo.new_zeros(albedo.shape[1], len(self.groups.sample_count))
-        scaled_albedo = albedo.T / self.samples**2
-        return zeros.index_add(1, self.groups.sample_to_group, scaled_albedo).T
+        return zeros.index_add(1, self.groups.sample_to_group, albedo.T / self.samples**2).T
 
     @cached_property
     def groups(self) -> PixelGroups:
@@ -351,8 +350,7 @@ def _distribute(
     corner_rows = values.new_zeros(corner_rows_shape)
     for value, seen_face, weight in split_samples(values, sample_to_seen_face, weights.to(values)):
         # Values times weights. Rows are pairs of corner and value, columns are samples.
-        weighted = (weight[:, None] * value).flatten(0, 1)
-        corner_rows.index_add_(1, seen_face, weighted)
+        corner_rows.index_add_(1, seen_face, (weight[:, None] * value).flatten(0, 1))
     return corner_rows
 
 
@@ -472,8 +470,6 @@ def _fragments_of_views(
     # Axes: coordinates x and y, corner, seen face.
     outlines = projected.flatten(0, 1).T[:2].index_select(1, projected_corners)
     outlines = outlines.unflatten(1, (3, -1))
-    # A face is seen from behind if its corners are clockwise in the image, in which y points up.
-    is_seen_from_behind = doubled_areas(outlines) < 0
     return Fragments(
         shape=settings.shape,
         samples=settings.samples,
@@ -481,7 +477,8 @@ def _fragments_of_views(
         coverage=sample_count.double() / settings.samples**2,
         faces=seen_faces,
         corners=corners.T,
-        facing=torch.where(is_seen_from_behind, -1.0, 1.0).double()[:, None],
+        # Corners of a face that is seen from behind are clockwise in the image, in which y is up.
+        facing=torch.where(doubled_areas(outlines) < 0, -1.0, 1.0).double()[:, None],
         outlines=outlines.permute(2, 1, 0),
         sample_to_pixel=torch.repeat_interleave(sample_count, output_size=len(covered)),
         sample_to_seen_face=(is_seen.cumsum(0) - 1).index_select(0, shown),

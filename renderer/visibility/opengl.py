@@ -103,8 +103,7 @@ def _check(context: moderngl.Context) -> None:
     faces = np.array([[0, 2, 1], [0, 1, 2], [3, 4, 5]])
     # Expected face at each of 4 × 4 samples. Face 0 is seen from behind and is left out.
     expected = [[2, 2, 1, 1], [2, 1, 1, 1], [1, 1, 1, 1], [1, 1, 1, 1]]
-    ids = _draw(context, points, faces, (4, 4), closed=True)
-    if ids[0].tolist() != expected:
+    if _draw(context, points, faces, (4, 4), closed=True)[0].tolist() != expected:
         name = context.info["GL_RENDERER"]
         raise InputError(f"the OpenGL driver {name} renders wrong faces: use the rasterizer numpy")
 

@@ -307,8 +307,7 @@ def _pixels_of_cells(cells: Tensor, fragments: Fragments) -> Tensor:
     """Find the row-major pixels to which samples, row-major in the whole image, belong."""
     samples = fragments.samples
     width = fragments.shape[1]
-    pixel_row = cells // (width * samples**2)
-    return pixel_row * width + cells % (width * samples) // samples
+    return cells // (width * samples**2) * width + cells % (width * samples) // samples
 
 
 class _Silhouettes:
@@ -352,8 +351,7 @@ class _Silhouettes:
     def crossings_along(self, axis: int) -> Crossings:
         """Find visible silhouettes between neighbors in a row (`axis` is X) or in a column."""
         rows, columns = self.sample_grid.shape
-        start = self.places[:, self.ends[0]]
-        end = self.places[:, self.ends[1]]
+        start, end = self.places[:, self.ends].unbind(1)
         # Places (cuts) where edges cross rows of samples for the axis X, or columns for Y.
         across_and_along = [1 - axis, axis]
         shape = (rows, columns) if axis == X else (columns, rows)
@@ -439,8 +437,7 @@ def _cut_edges(
     line = torch.arange(len(edge), device=edge.device) - (cuts_before_edge - first_line)[edge]
     # Position of the crossing on the edge, from 0 at the start of the edge to 1 at its end.
     fraction = (line - start[0, edge]) / (end[0] - start[0])[edge]
-    position = start[1, edge] + fraction * (end[1] - start[1])[edge]
-    next_sample = position.ceil().long()
+    next_sample = (start[1, edge] + fraction * (end[1] - start[1])[edge]).ceil().long()
     is_inside = (next_sample > 0) & (next_sample < shape[1])
     return edge[is_inside], line[is_inside], fraction[is_inside], next_sample[is_inside]
 
