@@ -15,6 +15,7 @@ In shapes, `size` is the number of functions of a basis.
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -257,7 +258,11 @@ class LocalBasis(Basis):
 
     @abstractmethod
     def connect(
-        self, points: Tensor, normals: Tensor, positions: Tensor | None, lobe_width: float
+        self,
+        points: Tensor,
+        normals: Tensor,
+        positions: Tensor | None = None,
+        lobe_width: float = math.inf,
     ) -> LightPaths:
         """Find the straight paths from light sources to S surface points, without shadows.
 

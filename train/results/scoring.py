@@ -235,6 +235,11 @@ class Scores(ShortRepr):
         return self._metrics_by("label") if len(self.predicted.labels) > 1 else {}
 
     @cached_property
+    def by_source(self) -> dict[str, Metrics]:
+        """Metrics of the photographs of each source."""
+        return self._metrics_by("source")
+
+    @cached_property
     def groups(self) -> dict[str, Metrics]:
         """Metrics of the photographs of each source, mesh or class, as `by` says."""
         return self._metrics_by(self.by)
@@ -273,7 +278,7 @@ class Scores(ShortRepr):
         predicted = self.predicted
         # `by_label` is empty if there is a single label. The file then has no lists for it.
         has_labels = bool(self.by_label)
-        groups = {"by_label": self.by_label, "by_source": self._metrics_by("source")}
+        groups = {"by_label": self.by_label, "by_source": self.by_source}
         groups[SUMMARY_KEYS[self.by]] = self.groups
         summary: dict[str, Any] = {
             "label": predicted.labels if has_labels else predicted.labels[0],
