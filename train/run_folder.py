@@ -29,8 +29,8 @@ PUBLISHED = "model.safetensors"
 # File in the folder of a run that hardened a classifier of the user. It has the trained weights
 # under the names that they have in the file of the user.
 WEIGHTS = "weights.pt"
-# Weights before a first training on photographs, in the folder of this training.
-ORIGINAL = "original.pt"
+# Weights before a first training on photographs, in the folder of that training.
+ORIGINAL = "before_photographs.pt"
 METRICS = "metrics.jsonl"
 # Sub-folder of a run with images of the training renders of some epochs.
 RENDERS = "renders"
@@ -45,8 +45,8 @@ TEST_SIZE = 2**16
 
 def find_original(folder: Path, network: str | None) -> Path | None:
     """Find the file of the weights before a first training on photographs, if a run has had one."""
-    file = Path(str(network)) / ORIGINAL
-    return file if file.parents[1] in (folder, folder.parent) and file.is_file() else None
+    file, of = Path(str(network), ORIGINAL).resolve(), folder.resolve()
+    return file if file.parents[1] in (of, of.parent) and file.is_file() else None
 
 
 @contextmanager

@@ -359,7 +359,9 @@ def as_photographs(name: str, given: Tensor | np.ndarray) -> UInt8[Tensor, "N 3 
         fault = f"{name} is {dtype} of shape {shape}"
         raise InputError(f"{fault}: give uint8 of shape (N, 3, height, width)")
     # torch takes only arrays that may be written to and have no negative strides.
-    return given if isinstance(given, Tensor) else torch.from_numpy(np.array(given))
+    if isinstance(given, Tensor):
+        return given
+    return torch.from_numpy(np.require(given, requirements=["C", "W"]))
 
 
 class ProjectedLight(NamedTuple):

@@ -275,8 +275,10 @@ def _read_light_map(path: Path, degree: int, roughness: float | None) -> Tensor:
 
     `roughness` is that of the smoothest surface, whose highlights must not get dark rings, or None.
     """
-    modified = path.stat().st_mtime_ns if path.exists() else 0
-    coefficients = _project_map(path, modified, degree)
+    errors.require_file(path, "give the path of an .npy, .hdr or .exr file")
+    of = path.stat()
+    state = of.st_dev, of.st_ino, of.st_size, of.st_mtime_ns, of.st_ctime_ns
+    coefficients = _project_map(path, state, degree)
     if roughness is not None:
         coefficients = coefficients * window_without_ringing(coefficients, roughness)[:, None]
     luminance = mean_luminance(coefficients)
@@ -287,6 +289,6 @@ def _read_light_map(path: Path, degree: int, roughness: float | None) -> Tensor:
 
 
 @lru_cache(maxsize=1)
-def _project_map(path: Path, modified: int, degree: int) -> Tensor:
+def _project_map(path: Path, state: tuple[int, ...], degree: int) -> Tensor:
     """Project an environment map. Scenes load the last one with a window and without."""
     return harmonics.project(environment.read_panorama(path), degree)

@@ -133,7 +133,7 @@ def _train_in(folder: Path, settings: ExperimentSettings, command: str, out: Pat
             # runs in the subfolders of its folder, to which the baselines write.
             for run in reversed(runs):
                 run.begin()
-            if initial and folder.name == PHOTOGRAPHS_FIRST and distributed.rank() == 0:
+            if initial and folder == out / PHOTOGRAPHS_FIRST and distributed.rank() == 0:
                 state = {"architecture": initial.architecture, "model": initial.weights}
                 checkpoints.save(folder / ORIGINAL, state)
             for run in runs:

@@ -83,13 +83,14 @@ def remove_run(folder: Path, *, with_others: bool = True) -> None:
     removal is stopped, what is left belongs to the run that config.yaml describes. The log stays.
     `with_others=False` keeps the first training and the baselines, which may be resumed.
     """
-    names = (*OF_RUN, ORIGINAL, run_folder.FAILURE, PAGE, run_folder.RENDERS, BEFORE, KEPT_ASIDE)
+    names = (*OF_RUN, run_folder.FAILURE, PAGE, run_folder.RENDERS, BEFORE, KEPT_ASIDE)
     logs = [*folder.glob("events.out.tfevents.*"), *folder.glob(f"*/{SUMMARY}")]
     remove(*(folder / name for name in names), *logs)
     with suppress(InputError):  # config.yaml may be missing.
         for name in (PHOTOGRAPHS_FIRST, *read_config(folder / CONFIG).get("compare", ())):
             if with_others and (folder / name / CONFIG).is_file():
                 remove_run(folder / name)
+                remove(folder / name / ORIGINAL)
     (folder / CONFIG).unlink(missing_ok=True)
 
 
