@@ -45,8 +45,9 @@ TEST_SIZE = 2**16
 
 def find_original(folder: Path, network: str | None) -> Path | None:
     """Find the file of the weights before a first training on photographs, if a run has had one."""
-    file, of = Path(str(network), ORIGINAL).resolve(), folder.resolve()
-    return file if file.parents[1] in (of, of.parent) and file.is_file() else None
+    first = Path(str(network)).name
+    files = (of / first / ORIGINAL for of in (folder, folder.absolute().parent))
+    return next(filter(Path.is_file, files), None) if first else None
 
 
 @contextmanager
