@@ -308,7 +308,9 @@ def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:
     path = selected_file(run)
     if path is None:
         raise InputError(f"run={run} has no {BEST} or {PUBLISHED}: give another folder", "run")
-    return path, (_load_published(path) if path.suffix == ".safetensors" else load(path))
+    if path.suffix == ".safetensors":
+        return path, _load_published(path)
+    return path, load(path)
 
 
 def plain_weights(state: Mapping[str, Any]) -> dict[str, Tensor]:

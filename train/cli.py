@@ -401,7 +401,8 @@ def _as_text(value: str) -> str:
     if isinstance(parsed, list | Sweep) and not set("[](){}" + QUOTES) & set(inner):
         members = ",".join(_as_text(item.strip()) for item in inner.split(","))
         return f"[{members}]" if is_list else members
-    return quoted(value) if isinstance(parsed, str | int | float) and parsed != value else value
+    is_changed = isinstance(parsed, str | int | float) and parsed != value
+    return quoted(value) if is_changed else value
 
 
 def _as_list(value: str, is_text: bool) -> str:
@@ -440,7 +441,8 @@ def explain(error: BaseException, keys: Mapping[str, Any], words: Sequence[str])
     key = str(getattr(wrong, "full_key", None) or "")
     if isinstance(wrong, ConfigKeyError | ConfigAttributeError):
         # A key of the same name in another group is the most similar one.
-        moved = [known for known in keys if known.rpartition(".")[2] == key.rpartition(".")[2]]
+        name = key.rpartition(".")[2]
+        moved = [known for known in keys if known.rpartition(".")[2] == name]
         close = moved or get_close_matches(key, keys, 1, 0.5)
         advice = f"did you mean {close[0]}?" if close else "--help shows all settings"
         return f"{key} is not a setting: {advice}"
@@ -462,7 +464,8 @@ def explain(error: BaseException, keys: Mapping[str, Any], words: Sequence[str])
         # names the group. For a setting in such a group, it names nothing.
         named = re.search(r"full_key: (\S+)", str(wrong))
         parents = [word.partition("=")[0].rpartition(".")[0] for word in words]
-        types = {group: keys.get(group) for group in ([named[1]] if named else parents)}
+        groups = [named[1]] if named else parents
+        types = {group: keys.get(group) for group in groups}
         null = [group for group, kind in types.items() if NoneType in get_args(kind)]
         unset = [group for group in null if is_dataclass(without_none(types[group]))]
         return f"{unset[0]} is null: choose it first, as --help shows" if unset else None

@@ -122,7 +122,8 @@ def choose_precision(precision: str, device: torch.device, trained: nn.Module | 
     modules = [] if is_gpu or trained is None else trained.modules()
     layers = [module for module in modules if isinstance(module, nn.Conv2d)]
     # A depthwise convolution has as many groups as input channels, and more than one.
-    if is_native and not any(layer.groups == layer.in_channels > 1 for layer in layers):
+    has_depthwise = any(layer.groups == layer.in_channels > 1 for layer in layers)
+    if is_native and not has_depthwise:
         return "bfloat16"
     return "float16" if is_gpu else "float32"
 

@@ -77,7 +77,8 @@ def load(name: str) -> PublishedNetwork | PublishedDetector:
     folder = published_folder(PRETRAINED / name)
     loaded = load_run(folder)
     # The scores of a classifier are metrics by name, those of a detector are in groups of images.
-    scores = load_selected(folder)[1]["scores"]
+    _, state = load_selected(folder)
+    scores = state["scores"]
     facts = loaded.network, loaded.size, loaded.classes, name
     network: PublishedNetwork | PublishedDetector
     if isinstance(loaded, Classifier):
@@ -171,7 +172,8 @@ def publish(
     points: list[OperatingPoint] = []
     # A Python function of the user may build the network. It is called only if the
     # network must be calibrated.
-    if calibrate is not None or not str(state["architecture"].get("name")).startswith(PYTHON):
+    is_python = str(state["architecture"].get("name")).startswith(PYTHON)
+    if calibrate is not None or not is_python:
         # `load_run` raises an InputError if nobody could load the published network.
         loaded = load_run(path, model=network, trust_code=trust_code)
         if calibrate is not None and false_positive_rate is not None:

@@ -392,7 +392,7 @@ def _best_lights(
 def _confidences(
     scene: Scene, images: Images, attack_settings: AttackSettings, classifier: Classifier
 ) -> Float[Tensor, " lights"]:
-    """Compute the confidence in each light: images of all E examples in one light after the other.
+    """Compute the confidence in each light, whose images of all E examples follow each other.
 
     It is the lowest probability of the true class in its images, or 0 if one is misclassified.
     """

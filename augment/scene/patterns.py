@@ -358,9 +358,9 @@ def as_photographs(name: str, given: Tensor | np.ndarray) -> UInt8[Tensor, "N 3 
     if dtype != "uint8" or len(shape) != 4 or shape[1] != 3 or not all(shape):
         fault = f"{name} is {dtype} of shape {shape}"
         raise InputError(f"{fault}: give uint8 of shape (N, 3, height, width)")
-    # torch takes only arrays that may be written to and have no negative strides.
     if isinstance(given, Tensor):
         return given
+    # torch takes only arrays that may be written to and have no negative strides.
     return torch.from_numpy(np.require(given, requirements=["C", "W"]))
 
 

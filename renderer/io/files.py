@@ -30,8 +30,8 @@ def replacing(
     At the end of the block, the temporary file is moved to `path`. If the block
     raises an error, the temporary file is removed and the old file stays. If `path` is a symbolic
     link, the file it points to is replaced. A folder, a device or a read-only file raises
-    `OSError`. `durable` waits about 20 ms until the file is on the
-    disk. The old file is moved to `previous`, or deleted.
+    `OSError`. `durable` waits about 20 ms until the file is on the disk. The old file is moved to
+    `previous`, or deleted.
     """
     target = Path(os.path.realpath(path))
     temporary = target.with_name(TEMPORARY.replace("*", uuid4().hex))

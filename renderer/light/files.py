@@ -276,8 +276,9 @@ def _read_light_map(path: Path, degree: int, roughness: float | None) -> Tensor:
     `roughness` is that of the smoothest surface, whose highlights must not get dark rings, or None.
     """
     errors.require_file(path, "give the path of an .npy, .hdr or .exr file")
-    of = path.stat()
-    state = of.st_dev, of.st_ino, of.st_size, of.st_mtime_ns, of.st_ctime_ns
+    facts = path.stat()
+    # A file that is replaced or changed has another state.
+    state = facts.st_dev, facts.st_ino, facts.st_size, facts.st_mtime_ns, facts.st_ctime_ns
     coefficients = _project_map(path, state, degree)
     if roughness is not None:
         coefficients = coefficients * window_without_ringing(coefficients, roughness)[:, None]
@@ -290,5 +291,8 @@ def _read_light_map(path: Path, degree: int, roughness: float | None) -> Tensor:
 
 @lru_cache(maxsize=1)
 def _project_map(path: Path, state: tuple[int, ...], degree: int) -> Tensor:
-    """Project an environment map. Scenes load the last one with a window and without."""
+    """Project an environment map. `state` differs if its file is another, or was changed.
+
+    The last result is kept, because scenes load a map with a window and without.
+    """
     return harmonics.project(environment.read_panorama(path), degree)

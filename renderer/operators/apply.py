@@ -364,8 +364,8 @@ class TransferOperator:
         key = (background, lights.dtype, lights.device)
         is_kept = isinstance(background, float | int) and lights.ndim <= 2
         # Other threads may replace the pair meanwhile.
-        last_key, last = vars(self).get("_last_background", (None, None))
-        if is_kept and last_key == key:
+        last_key, last = self._last_background.get("pair", (None, None))
+        if is_kept and last is not None and last_key == key:
             return last
         images = as_background(background, self.settings.size, lights).flatten(-2)
         # Background of the P covered pixels. Only these mix with the mesh.
@@ -378,7 +378,7 @@ class TransferOperator:
         coverage = self.coverage.to(images)[None]
         prepared = (images, background_term(coverage, at_pixels, self.settings.encoding))
         if is_kept:
-            vars(self)["_last_background"] = key, prepared
+            self._last_background["pair"] = key, prepared
         return prepared
 
     def to(self, device: torch.device | str) -> TransferOperator:
@@ -415,6 +415,11 @@ class TransferOperator:
         those of the colors.
         """
         return list(self.transfer)
+
+    @cached_property
+    def _last_background(self) -> dict[str, tuple[Any, tuple[Tensor, Tensor]]]:
+        """Key of the last gray background, and what was prepared for it ("pair")."""
+        return {}
 
     @cached_property
     def _placement(self) -> Tensor:

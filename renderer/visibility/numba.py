@@ -56,8 +56,8 @@ _njit: Callable[..., Any] = partial(numba.njit, nogil=True, error_model="numpy")
 def _compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a function for TYPES, and store the code in a file for the next process.
 
-    numba compiles anew if this file or the name of the function changes. The name gets a sum of
-    the file of the functions that are compiled in.
+    numba compiles anew if this file or the name of the function changes. Functions of another file
+    are compiled in, so the name gets a checksum of that file.
     """
     function.__qualname__ += f"_{crc32(Path(exact.__file__).read_bytes())}"
     # numba may raise any exception if its cache is read-only or damaged.

@@ -175,7 +175,8 @@ def _write_attack(
     details = []
     # The search chose another scene than the given one, in which the network was wrong already.
     if scene != settings.scene:
-        changed = [item for item in vars(scene).items() if item not in vars(settings.scene).items()]
+        before = vars(settings.scene)
+        changed = [item for item in vars(scene).items() if item[1] != before[item[0]]]
         changes = shlex.join(f"scene.{key}={value}" for key, value in changed)
         details.append(f"{name} is misclassified in the given scene, but not with {changes}")
     # With None, only attacks that use gradients are checked.

@@ -25,9 +25,9 @@ from train.settings import label_names, read_objects
 # Processes that share a data set differ in these settings only.
 CIRCUMSTANCES = ("out", "shard", "shards", "device", "trust")
 DEFAULT_SIZE = 224
-# Bytes of a pixel in the files of a render before compression, by the name of the map, and bytes of
-# the details of a render with the headers of its files.
+# Bytes of a pixel in the files of a render before compression, by the name of the map.
 BYTES = {"image": 3, "mask": 1, "depth": 2, "normals": 3}
+# Largest number of bytes of the details of a render and of the headers of its files.
 DETAILS = 10_000
 
 

@@ -5,11 +5,10 @@ A photograph is shown upright, as its EXIF orientation says, and brought to the 
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import takewhile
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal, NamedTuple
@@ -22,7 +21,7 @@ from PIL import ExifTags, Image
 
 from augment.files import read_lines
 from augment.settings import NO_CLASS_PIXEL
-from renderer.errors import InputError, explained
+from renderer.errors import InputError, composed, explained
 from renderer.io.images import SUFFIXES, gray_factor, is_hidden, open_image, read_rgb
 from train import console
 from train.data.photographs import find_unlabeled, visible_files
@@ -133,15 +132,15 @@ def read_masks(folder: Path) -> tuple[list[Annotated], dict[str, Path], list[str
     else:
         raise InputError(f"photos={folder} lacks images/ or masks/: move them there", "photos")
     shown = [str(item.path) for item in find_unlabeled(images)]
-    all_paths = {name: (masks / name).with_suffix(".png") for name in shown}
-    paths = {name: path for name, path in all_paths.items() if path.is_file()}
-    # Other masks, whose names may have another form of Unicode than those of the photographs.
-    others = {*masks.rglob("*.png")} - {*paths.values()} if len(paths) < len(shown) else ()
-    by_form = {normalize("NFC", str(path)): path for path in others}
-    forms = {name: normalize("NFC", str(path)) for name, path in all_paths.items()}
+    wanted = {name: (masks / name).with_suffix(".png") for name in shown}
+    paths = {name: path for name, path in wanted.items() if path.is_file()}
     missing = [name for name in shown if name not in paths]
-    paths |= {name: by_form[forms[name]] for name in missing if forms[name] in by_form}
-    missing = [name for name in shown if name not in paths]
+    # Masks that no photograph names exactly may have names in another form of Unicode.
+    unused = {*masks.rglob("*.png")} - {*paths.values()} if missing else ()
+    by_form = {composed(str(path)): path for path in unused}
+    found = {name: by_form.get(composed(str(wanted[name]))) for name in missing}
+    paths |= {name: path for name, path in found.items() if path}
+    missing = [name for name in missing if name not in paths]
     if not paths:
         first = Path(missing[0]).with_suffix(".png")
         raise InputError(f"{masks} has no mask {first}: add it", "photos")
@@ -276,33 +275,45 @@ def _find_images(file: Path, names: Sequence[str]) -> dict[str, Path]:
     # An image beside the file replaces one in the folder above.
     paths = {name: of / name for of in folders for name in names if (of / name).is_file()}
     # Names that no file has exactly may have another form of Unicode: archives of a Mac change it.
-    for form in (str, partial(normalize, "NFC")):
-        missing = [name for name in names if name not in paths]
-        # Other images in the folder, by name without folder. Most files need no search.
-        others: dict[str, list[Path]] = defaultdict(list)
-        used = {*paths.values()}
-        for path in visible_files(folders[0]) if missing else ():
-            if path.suffix.lower() in SUFFIXES and folders[0] / path not in used:
-                others[form(path.name)].append(folders[0] / path)
-        uses = Counter(form(PurePosixPath(name).name) for name in names)
-        for name in missing:
-            parts = PurePosixPath(form(name)).parts
-            # Number of equal parts at the end of the path of each image of this name.
-            equal_parts = {
-                image: _equal_ends(Path(form(str(image))).parts, parts)
-                for image in others[parts[-1]]
-            }
-            most = max(equal_parts.values(), default=0)
-            # An image in another folder may be any of several that have its name.
-            if most == 1 and uses[parts[-1]] > 1:
-                continue
-            found = [image for image in equal_parts if equal_parts[image] == most]
-            if len(found) > 1:
-                listed = " and ".join(map(str, found[:2]))
-                raise InputError(f"{file} names the image {name}, which may be {listed}")
-            if found:
-                paths[name] = found[0]
+    for form in (str, composed):
+        if len(paths) < len(names):
+            paths |= _search_images(file, folders[0], names, paths, form)
     return paths
+
+
+def _search_images(
+    file: Path,
+    folder: Path,
+    names: Sequence[str],
+    paths: Mapping[str, Path],
+    form: Callable[[str], str],
+) -> dict[str, Path]:
+    """Find images anywhere in a folder for the names without a path, compared in one form."""
+    # Images that no name has found yet, by their names without folder.
+    others: dict[str, list[Path]] = defaultdict(list)
+    used = {*paths.values()}
+    for path in visible_files(folder):
+        if path.suffix.lower() in SUFFIXES and folder / path not in used:
+            others[form(path.name)].append(folder / path)
+    uses = Counter(form(PurePosixPath(name).name) for name in names)
+    found = {}
+    for name in [name for name in names if name not in paths]:
+        parts = PurePosixPath(form(name)).parts
+        # Images of this name, by the number of equal parts at the end of their paths.
+        by_equal_parts: dict[int, list[Path]] = defaultdict(list)
+        for image in others[parts[-1]]:
+            by_equal_parts[_equal_ends(Path(form(str(image))).parts, parts)].append(image)
+        most = max(by_equal_parts, default=0)
+        # An image in another folder may be any of several that have its name.
+        if most == 1 and uses[parts[-1]] > 1:
+            continue
+        images = by_equal_parts[most]
+        if len(images) > 1:
+            listed = " and ".join(map(str, images[:2]))
+            raise InputError(f"{file} names the image {name}, which may be {listed}")
+        if images:
+            found[name] = images[0]
+    return found
 
 
 def _equal_ends(*parts: Sequence[str]) -> int:

@@ -111,7 +111,10 @@ class Jackknife:
         return Estimate(float(self.value), low, high, self.over)
 
     def proportion(self, hits: Shaped[np.ndarray, " n"]) -> Proportion:
-        """Count the hits of which this is the mean. Without a repeated unit, Wilson's interval."""
+        """Count the hits of which this is the mean.
+
+        If no unit occurs twice, the interval is Wilson's.
+        """
         proportion = fraction(int(hits.sum()), len(hits))
         if self.unit_count == proportion.n:
             return replace(proportion, over=self.over)

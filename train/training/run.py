@@ -110,7 +110,7 @@ class Run:
             self.trainer = self._build_trainer(record, threads)
             if settings.train.recognize:
                 recognizing_layers(self.trainer.model.network, self.data.size)
-        # Network that the scores call the one before the training.
+        # The scores compare the trained network with this one.
         self.before = self.trainer.initial
         original = find_original(folder, settings.network)
         if self.before and original:
