@@ -405,7 +405,7 @@ def _find_negative_minima(
     subdivisions = _COARSE_SUBDIVISIONS if degree <= _COARSE_GRID_DEGREE else _FINE_SUBDIVISIONS
     grid_directions, grid_harmonics, grid_neighbors = _grid(degree, subdivisions)
     # Radiance of each light (rows) in each direction of the grid (columns).
-    radiance = lights @ grid_harmonics
+    radiance = _product(lights, grid_harmonics)
     largest = np.abs(radiance).max(1)
     upper_limit = np.where(largest > rounding_radiance, _ABOVE_ZERO * largest, -np.inf)
     light_index, grid_index = np.nonzero(radiance < upper_limit[:, None])
@@ -418,7 +418,8 @@ def _find_negative_minima(
         grid_index = grid_index[is_low]
     # SH coefficients of the 3 first and the 9 second derivatives of the light of each start
     # direction. Axes: start, derivative, coefficient.
-    derivatives = (lights @ _derivatives(degree)).reshape(len(lights), 3 + 9, -1)[light_index]
+    derivatives = lights @ _derivatives(degree)
+    derivatives = derivatives.reshape(len(lights), 3 + 9, -1)[light_index]
     directions = grid_directions[grid_index]
     for _ in range(_NEWTON_STEPS):
         directions = _step_down(directions, derivatives)
@@ -472,7 +473,7 @@ def _harmonics(directions: Array, degree: int) -> Array:
     x_powers, y_powers, z_powers = powers.transpose(1, 0, 2)
     # One row for each monomial x^a y^b z^c, one column for each direction.
     monomials = x_powers[exponents[0]] * y_powers[exponents[1]] * z_powers[exponents[2]]
-    return monomials.T @ coefficients
+    return _product(monomials.T, coefficients)
 
 
 @cache_tensors
@@ -523,3 +524,8 @@ def _grid(degree: int, subdivisions: int) -> tuple[Array, Array, Array]:
     directions = np.array(sphere.vertices)
     harmonics = np.ascontiguousarray(_harmonics(directions, degree).T)
     return directions, harmonics, np.array(neighbors).T
+
+
+def _product(left: Array, right: Array) -> Array:
+    """Multiply matrices in torch, as threads of NumPy's BLAS would spin beside those of torch."""
+    return (torch.from_numpy(left) @ torch.from_numpy(right)).numpy()

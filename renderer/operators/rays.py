@@ -5,7 +5,7 @@ directions, and each pixel divides the directions among its samples. No two
 samples of a pixel share a direction, and each sample has at least
 `DIRECTIONS_PER_SAMPLE` of them. The image therefore converges as the number of
 samples grows. Pixels that can see no other surface, such as all pixels of a
-convex mesh, cast no rays.
+convex mesh, cast no rays, and rays above the horizon of their face are not cast.
 
 Each lamp, and each pixel of a projector's pattern, is one basis function of local
 light. Its coefficient is its RGB power. Each sample of a view casts a ray to each
@@ -25,7 +25,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
+from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from renderer.errors import import_package, require_bounded, require_shape
@@ -54,6 +55,12 @@ OFFSET = 1e-5
 # Faces are compared with vertices to find the pixels that need rays. This is the largest
 # number of comparisons, which takes about a second. With more, all pixels cast rays.
 MAX_COMPARISONS = 2**30
+# Largest number of vertices above a face whose horizon is computed.
+MAX_ABOVE = 64
+# Number of comparisons of a face with a vertex that take as long as a ray, or less.
+COMPARISONS_PER_RAY = 8
+# Sines of elevations are compared with this room for rounding.
+ROUNDING = 1e-9
 # The plane of a face may block light that would reach an interpolated normal (smooth
 # shading). This is ignored if at most this fraction of uniform environment light is blocked.
 MAX_IGNORED_LIGHT = 1 / 1024
@@ -222,7 +229,7 @@ class Rays:
         The face of a sample blocks all light from below its plane, as if the mesh were the surface
         of a solid. Pixels that can see no other surface are left out. Each result has some pixels.
         """
-        pixels, may_hit = self._pixels_to_cast(surface)
+        pixels, horizon = self._pixels_to_cast(surface, len(directions))
         if not len(pixels):
             return
         normals, planes = surface.normals, surface.planes
@@ -248,7 +255,8 @@ class Rays:
                 height = cosine if normals is planes else at_places @ planes[sample].mT
                 is_in_front = cosine > 0
                 # A ray is only cast above the face, and if it may hit another face.
-                cast = torch.nonzero(is_in_front & (height > 0) & may_hit[sample][:, None])
+                may_hit = (height > 0) & (height <= horizon[sample][:, None])
+                cast = torch.nonzero(is_in_front & may_hit)
                 place, turn, row = cast.T
                 origins = starts[sample[place, row]]
                 face = self.first_hit(origins, in_turns[turn * places + place])
@@ -285,31 +293,84 @@ class Rays:
             vertices = vertices[ConvexHull(vertices).vertices]
         return torch.from_numpy(vertices).double()
 
-    def _pixels_to_cast(self, surface: Surface) -> tuple[Int[Tensor, " B"], Bool[Tensor, " S"]]:
-        """Find the pixels for which the mesh may block light, and the samples whose rays may hit.
+    def _pixels_to_cast(
+        self, surface: Surface, direction_count: int
+    ) -> tuple[Int[Tensor, " B"], Float[Tensor, " S"]]:
+        """Find the pixels for which the mesh may block light, and the horizon of each sample.
 
         A pixel is returned if one of its samples fulfills one of two conditions. First, a vertex of
         the mesh lies above the plane of the face on which the sample lies. Second, the shading
         normal differs from the normal of the face by an angle a, so that the plane of the face
         blocks the fraction (1 - cos a) / 2 of uniform light, and this exceeds `MAX_IGNORED_LIGHT`.
-        A ray from a sample can only hit another face under the first condition. All are returned
-        if the test would need more than `MAX_COMPARISONS` comparisons and would take longer than
-        the rays.
+        A ray from a sample can only hit another face if the sine of its elevation above the plane
+        is at most the horizon, which is 0 without the first condition. All pixels are returned if
+        the test would need more than `MAX_COMPARISONS` comparisons.
         """
         fragments = surface.fragments
         plane_normals = surface.face_planes
         hull_vertices = self._outermost
         if len(plane_normals) * len(hull_vertices) > MAX_COMPARISONS:
-            return torch.arange(len(fragments.pixels)), fragments.sample_to_pixel >= 0
+            return torch.arange(len(fragments.pixels)), torch.full((len(surface.planes),), math.inf)
         # The normals are processed in blocks to limit the memory.
         blocks = plane_normals.split(max(1, 8 * BLOCK // len(hull_vertices)))
         # Largest coordinate of a hull vertex along the normal of each seen face.
         highest = torch.cat([(block @ hull_vertices.T).amax(1) for block in blocks])
+        corners = surface.vertices[fragments.corners]
         # Height of the face itself along its normal.
-        height_of_face = (plane_normals * surface.vertices[fragments.corners[:, 0]]).sum(1)
+        height_of_face = (plane_normals * corners[:, 0]).sum(1)
+        may_hit = highest - height_of_face > self.offset
+        horizons = may_hit.double()
+        face_of_sample = fragments.sample_to_seen_face
+        pixel_count = may_hit[face_of_sample].double().mean() * len(fragments.pixels)
+        ray_count = pixel_count * direction_count
+        if may_hit.sum() * len(self._mesh.vertices) <= COMPARISONS_PER_RAY * ray_count:
+            horizons[may_hit] = self._horizons(corners[may_hit], plane_normals[may_hit])
+        horizon = horizons[face_of_sample]
         blocks_light = (surface.normals * surface.planes).sum(1) < 1 - 2 * MAX_IGNORED_LIGHT
-        may_hit = (highest - height_of_face > self.offset)[fragments.sample_to_seen_face]
-        return fragments.sample_to_pixel[may_hit | blocks_light].unique(), may_hit
+        pixels = fragments.sample_to_pixel[(horizon > 0) | blocks_light].unique()
+        return pixels, horizon + ROUNDING
+
+    def _horizons(
+        self, corners: Float[Tensor, "G 3 3"], normals: Float[Tensor, "G 3"]
+    ) -> Float[Tensor, " G"]:
+        """Bound the sine of the elevation at which points of G faces see the rest of the mesh.
+
+        If another face lies below a plane of slope t that contains an edge of the seen face and
+        rises beyond it, all rays between both have at most the slope t. The edge with the least
+        slope gives the bound. Faces with more than `MAX_ABOVE` vertices above them get 1.
+        """
+        origin = torch.from_numpy(self._mesh.origin)
+        corners = corners - origin
+        vertices = F.pad(torch.from_numpy(self._mesh.vertices) - origin, (0, 1), value=1.0)
+        faces = torch.from_numpy(self._mesh.faces).long()
+        entries = np.ones(faces.numel(), bool), (faces.ravel(), np.arange(faces.numel()) // 3)
+        faces_of_vertex = csr_matrix(entries, (len(vertices), len(faces)))
+        # The plane of each face, and a plane across it through each edge. Their normals point up
+        # and outward. A plane has its normal, and minus the coordinate along it.
+        outward = torch.linalg.cross(corners.roll(-1, 1) - corners, normals[:, None])
+        inside = ((corners.roll(-2, 1) - corners) * outward).sum(2, keepdim=True)
+        outward = F.normalize(outward * -inside.sign(), dim=2)
+        axes = torch.cat([normals[:, None], outward], 1)
+        coordinate = (axes * corners[:, [0, 0, 1, 2]]).sum(2, keepdim=True)
+        # Rays start at the offset above the face.
+        coordinate[:, 0] += self.offset
+        planes = torch.cat([axes, -coordinate], 2)
+        horizons = []
+        for block in planes.split(8 * BLOCK // len(vertices) + 1):
+            # The offset leaves room for the rounding of float32.
+            is_above = block[:, 0].float() @ vertices.float().T > -self.offset / 2
+            horizon = (is_above.sum(1) > MAX_ABOVE).double()
+            pairs = csr_matrix((is_above & (horizon == 0)[:, None]).numpy()) @ faces_of_vertex
+            row, other = (torch.from_numpy(index).long() for index in pairs.nonzero())
+            # Of the vertices of the other face: height, and distance beyond each edge.
+            coordinates = torch.einsum("evd,eld->lev", vertices[faces[other]], block[row])
+            height, beyond = coordinates[0], coordinates[1:]
+            slope = height / beyond
+            least = slope.where(beyond > 0, math.inf).where(height > 0, 0.0).amax(2)
+            largest = slope.where((height <= 0) & (beyond < 0), math.inf).amin(2)
+            bound = least.where(least <= largest, math.inf).amin(0).atan().sin()
+            horizons.append(horizon.scatter_reduce(0, row, bound, "amax"))
+        return torch.cat(horizons)
 
     def first_hit(
         self,

@@ -17,12 +17,13 @@ from renderer.camera import OrthographicCamera, orbit_cameras
 from renderer.errors import InputError
 from renderer.light.files import ambient, load_light
 from renderer.light.harmonics import nonzero_coefficients, quadrature
-from renderer.mesh import Mesh
+from renderer.mesh import Mesh, normalize
 from renderer.operators import rays
 from renderer.operators import shadows as precomputed
 from renderer.operators.apply import TransferOperator
 from renderer.rendering import precompute_transfer, render
 from renderer.settings import ImageSettings
+from renderer.solids import solid
 
 ABOVE = OrthographicCamera(0, 0, 2.0)
 EPS32 = torch.finfo(torch.float32).eps
@@ -118,6 +119,36 @@ def test_a_mesh_with_too_many_faces_to_compare_is_found_convex_by_its_rays(monke
     monkeypatch.setattr(rays, "MAX_COMPARISONS", 0)
     assert torch.equal(shaded(CONVEX["a ball"]).nonzero, nonzero_coefficients(6))
     assert len(shaded(dented()).nonzero) == 49
+
+
+CONCAVE = {
+    "a dented ball": dented(),
+    "inside out": Mesh.plain(dented(1).vertices, dented(1).faces[:, ::-1]),
+    "many small faces": solid("orange"),
+    "a handle": solid("cup"),
+    "many parts": hard.heap(),
+}
+
+
+@pytest.mark.parametrize("normals", ["flat", "smooth"])
+@pytest.mark.parametrize("name", CONCAVE)
+def test_no_ray_above_the_horizon_of_its_face_hits_another_face(name, normals, monkeypatch):
+    mesh, cast = CONCAVE[name], []
+    first_hit = rays.Rays.first_hit
+
+    def count(self, origins, *rest):
+        cast[-1] += len(origins)
+        return first_hit(self, origins, *rest)
+
+    monkeypatch.setattr(rays.Rays, "first_hit", count)
+    found = []
+    for comparisons in (0, 2**30):
+        monkeypatch.setattr(rays, "COMPARISONS_PER_RAY", comparisons)
+        cast.append(0)
+        camera = OrthographicCamera(57.3, 17.2, 2.2)
+        found.append(shaded(normalize(mesh), camera, size=24, normals=normals).transfer)
+    assert torch.equal(*found)
+    assert cast[1] < cast[0]
 
 
 @pytest.mark.parametrize("bounces", [0, 1])
