@@ -83,7 +83,8 @@ def load(model: str, _: Path | None, facts: NetworkFacts, is_random: bool) -> Ta
 
     network = _model(getattr(library, architecture), model, config, name, is_random)
     # What the user gives replaces what the files state.
-    size, mean, std, is_bgr, *sources = _read_preprocessor(library, model, config)
+    with reading_network(name, "prepares no images (3, height, width)", "use another network"):
+        size, mean, std, is_bgr, *sources = _read_preprocessor(library, model, config)
     size = facts.size or size
     if facts.normalization is not None:
         mean, std = mean_and_std(facts.normalization)

@@ -217,8 +217,9 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
         # Keys of leaves that are no images: all but `IMAGES`, if the sample has one of those.
         hidden = {"depth"} if {*IMAGES}.isdisjoint(keys) else {*keys} - {*IMAGES}
         # Torchvision tells which of the others are images: the first of plain tensors.
+        marked = tv_tensors.Image, tv_tensors.Video
         others = [
-            None if key in hidden and (key == "depth" or v2._utils.is_pure_tensor(leaf)) else leaf
+            None if key in hidden and (key == "depth" or not isinstance(leaf, marked)) else leaf
             for key, leaf in zip(keys, leaves, strict=True)
         ]
         found = zip(leaves, keys, self._needs_transform_list(others), strict=True)

@@ -5,7 +5,8 @@
 The answer to each question is a few lines of JSON. A line compares one way with
 another, and the two take turns. The command first runs the tests of
 tests/train/test_gpu.py, and then measures. Each question is answered by a
-process of its own, which is stopped after --minutes. If a question fails, its
+process of its own. All of them together take at most --minutes. The same command
+then answers the questions that are left. If a question fails, its
 line has the error, and the command continues with the next question. Meshes,
 data and networks are the project's own. If there are several GPUs, `training` runs
 on one and on all of them. --device cpu rehearses the questions that need no
@@ -694,7 +695,7 @@ def main(arguments: Sequence[str] | None = None) -> list[Row]:
     )
     parser.add_argument("--device", default="cuda", help="cpu: a rehearsal")
     parser.add_argument("--questions", nargs="+", choices=QUESTIONS, default=list(QUESTIONS))
-    parser.add_argument("--minutes", type=float, default=9.0, help="no question takes longer")
+    parser.add_argument("--minutes", type=float, default=9.0, help="limit for all questions")
     parser.add_argument("--here", action="store_true", help="in this process, without that limit")
     parser.add_argument("--out", type=Path, help="a .jsonl file, to which lines are added")
     options = parser.parse_args(arguments)

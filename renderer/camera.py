@@ -163,7 +163,7 @@ class Camera(ABC):
         Raises:
             InputError: If the center lies behind a perspective camera.
         """
-        # The center relative to the pivot (`_from_pivot`), in the axes of the camera.
+        # The center relative to the pivot (`_from_pivots`), in the axes of the camera.
         right, up, back = self.axes() @ _from_pivots([self], center)[0, 0]
         changed: dict[str, Any] = {
             "right": scale * (self.right + right),

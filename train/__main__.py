@@ -51,7 +51,7 @@ def run_name(overrides: Sequence[str], fixed: Collection[str] = (), parent: str 
     """Name the folder of a run by the settings that the command line gives.
 
     For the arguments seed=0 and augment=none, the name is
-    `augment-none+seed-0@7d0a3f52`. It has the settings in alphabetical order,
+    `augment-none+seed-0@074d413a`. It has the settings in alphabetical order,
     and ends with a hash of them. Characters that are special to file systems or
     to Hydra are replaced by "_". `fixed` settings count in the hash, but are not shown. A folder in
     `parent` with the same hash keeps its name.

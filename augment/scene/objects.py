@@ -411,7 +411,7 @@ class Conditions(ShortRepr):
     pixels: Float[Tensor, "... V 3 height width"] | None = None
     positions: Float[Tensor, "... L 3"] | None = None
     cameras: Float[Tensor, "... 3"] | None = None
-    gloss: Float[Tensor, "... F 3"] | Float[Tensor, "... 1 3"] | None = None
+    gloss: Float[Tensor, "... 1 3"] | Float[Tensor, "... F 3"] | None = None
     hue: Float[Tensor, "... F"] | None = None
 
     def __post_init__(self) -> None:

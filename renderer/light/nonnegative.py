@@ -146,7 +146,7 @@ def _project_channel(channel: bytes) -> Array:
 
     The light is one color channel, in bytes that can be hashed.
     """
-    light = np.frombuffer(channel)
+    light = np.frombuffer(bytearray(channel))
     mean = light[0]
     rounding_radiance = _rounding_radiance(light[None])
     uniform = np.concatenate([[max(mean, 0.0)], 0 * light[1:]])

@@ -357,8 +357,7 @@ class Rays:
         planes = torch.cat([axes, -coordinate], 2)
         horizons = []
         for block in planes.split(8 * BLOCK // len(vertices) + 1):
-            # The offset leaves room for the rounding of float32.
-            is_above = block[:, 0].float() @ vertices.float().T > -self.offset / 2
+            is_above = block[:, 0] @ vertices.T > 0
             horizon = (is_above.sum(1) > MAX_ABOVE).double()
             pairs = csr_matrix((is_above & (horizon == 0)[:, None]).numpy()) @ faces_of_vertex
             row, other = (torch.from_numpy(index).long() for index in pairs.nonzero())

@@ -102,9 +102,10 @@ def test_labels_of_a_sample_stay_and_its_image_changes():
 
 
 @pytest.mark.parametrize("kind, key", [(dict, "image"), (dict, "img"), (UserDict, "pixel_values")])
-def test_plain_tensors_before_a_named_image_stay(kind, key):
+def test_plain_tensors_and_pil_masks_beside_a_named_image_stay(kind, key):
     """The processors of transformers return a `UserDict`."""
     sample = {"boxes": torch.rand(2, 4), "mask": picture(1, 6, 6), "labels": torch.tensor([1, 2])}
+    sample["segmentation_map"] = Image.new("L", (6, 6), 3)
     relit = nb.RandomLighting("linear")(kind(sample | {key: picture(3, 6, 6)}))
     assert type(relit) is kind and all(relit[label] is sample[label] for label in sample)
     assert not torch.equal(relit[key], picture(3, 6, 6))
