@@ -255,7 +255,7 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
     if definition is None:
         raise ValueError(f"no .mtl file defines the material {name}")
     folder, is_linear, properties = definition
-    material = _Material()
+    color, texture = _Material()
     color_key, texture_key = "kd", "map_kd"
     if emitted := _emitted(properties):
         file.assume("the light that a black material emits is taken as its color")
@@ -279,13 +279,12 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
                         f'"{keyword} {text}" is no color: give red, green, blue from 0 to 1'
                     )
                 color = tuple(min(value, 1.0) for value in values * (3 // len(values)))
-                material = material._replace(color=color)
             case key if key == texture_key:
-                texture = _NEUTRAL_OPTIONS.sub("", text, count=1)
-                if not texture or texture.startswith("-"):
+                path = _NEUTRAL_OPTIONS.sub("", text, count=1)
+                if not path or path.startswith("-"):
                     fault = f'"{keyword} {text}" is not an image alone'
                     raise ValueError(f"{fault}: leave its options out")
-                material = material._replace(texture=(texture, folder))
+                texture = (path, folder)
             case "d" | "tr" as key:
                 # A number may follow the option "-halo".
                 opacities[key] = float("".join(text.partition(" #")[0].split()[-1:]))
@@ -293,19 +292,18 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
                 raise ValueError(f"the material {name} has {keyword}, which is not supported")
             case _:
                 file.ignore(keyword)
-    red, green, blue = material.color
+    red, green, blue = color
     # Programs write their default gray or black there. Texels are often the color itself.
-    if material.texture and red == green == blue < 1:
+    if texture and red == green == blue < 1:
         file.assume("a gray Kd beside map_Kd is taken as white, as in Blender")
-        material = material._replace(color=(1.0, 1.0, 1.0))
+        color = (1.0, 1.0, 1.0)
     elif is_linear:
-        encoded = encode(torch.tensor(material.color, dtype=torch.float64), "srgb")
-        material = material._replace(color=tuple(encoded.tolist()))
-    elif not {0, 1}.issuperset(material.color):
+        color = tuple(encode(torch.tensor(color, dtype=torch.float64), "srgb").tolist())
+    elif not {0, 1}.issuperset(color):
         file.assume("Kd is taken as sRGB-encoded")
     if opacities == {"tr": 1}:
         file.assume("Tr 1 is taken as opaque, as some programs write it")
         opacities = {}
     if not opacities.get("d", 1 - opacities.get("tr", 0)) >= mesh_file.OPAQUE:
         raise ValueError(f"the material {name} is transparent, which is not supported")
-    return material
+    return _Material(color, texture)
