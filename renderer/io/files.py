@@ -95,8 +95,7 @@ def remove(*paths: Path) -> None:
 
 def remove_unfinished(folder: Path) -> None:
     """Remove the temporary files of a killed process, if no other process writes to the folder."""
-    for unfinished in folder.glob(TEMPORARY):
-        unfinished.unlink(missing_ok=True)
+    remove(*folder.glob(TEMPORARY))
 
 
 def _flush(path: Path) -> None:
