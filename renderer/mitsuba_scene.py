@@ -136,8 +136,7 @@ def mitsuba_map(coefficients: torch.Tensor, height: int) -> torch.Tensor:
     horizontal, _ = equirectangular(1, 2 * height)
     polar = torch.linspace(0, math.pi, height, dtype=torch.float64)[:, None, None]
     up = torch.tensor([0.0, 0.0, 1.0])
-    directions = polar.sin() * horizontal + polar.cos() * up
-    return light_radiance(coefficients, directions)
+    return light_radiance(coefficients, polar.sin() * horizontal + polar.cos() * up)
 
 
 @dataclass(frozen=True)

@@ -85,8 +85,7 @@ def read_gltf(file: MeshFile) -> list[Part]:
             else:
                 surface, material_of_part = read_part(node["mesh"], number, weights)
                 # A small file can show one mesh very often.
-                needed += FACE_BYTES * len(surface.faces)
-                needed += VERTEX_BYTES * len(surface.values)
+                needed += FACE_BYTES * len(surface.faces) + VERTEX_BYTES * len(surface.values)
                 require_memory("its faces", needed, CPU)
                 placed_parts += _place(surface, material_of_part, gltf.poses[index])
     modes = {material.get("alphaMode") for material in gltf.tree.get("materials", ())}

@@ -514,5 +514,4 @@ def _image(file: GltfFile, info: dict[str, Any]) -> tuple[Image.Image, Placement
     sampler = {} if sampler_index is None else file.entry("samplers", sampler_index)
     uv_set = transform.get("texCoord", info.get("texCoord", 0))
     wraps = (sampler.get("wrapS", REPEAT), sampler.get("wrapT", REPEAT))
-    placement = Placement(uv_set, tuple(map(tuple, rows.tolist())), wraps)
-    return file.image(info["index"]), placement
+    return file.image(info["index"]), Placement(uv_set, tuple(map(tuple, rows.tolist())), wraps)

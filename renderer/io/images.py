@@ -426,12 +426,11 @@ def _coded_colors(path: Path) -> tuple[int, int, int] | None:
         # each.
         file.seek(8)
         while len(header := file.read(8)) == 8 and header[4:] != b"IDAT":
-            length = int.from_bytes(header[:4], "big")
             if header[4:] == b"cICP":
                 primaries, curve, _, is_full = file.read(4)
                 return primaries, curve, is_full
             # A checksum of 4 bytes follows the data of the chunk.
-            file.seek(length + 4, io.SEEK_CUR)
+            file.seek(int.from_bytes(header[:4], "big") + 4, io.SEEK_CUR)
     return None
 
 

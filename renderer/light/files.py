@@ -285,8 +285,7 @@ def _read_light_map(path: Path, degree: int, roughness: float | None) -> Tensor:
     luminance = mean_luminance(coefficients)
     if luminance <= 0:
         raise InputError(f"environment map {path} is black: give a map with positive radiance")
-    scale = mean_luminance(probe("grace")) / luminance
-    return (coefficients * scale).float()
+    return (coefficients * (mean_luminance(probe("grace")) / luminance)).float()
 
 
 @lru_cache(maxsize=1)

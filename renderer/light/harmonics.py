@@ -410,8 +410,7 @@ def irradiance_error(
     # Harmonics are orthonormal, so the norm of the coefficients is proportional to the
     # root mean square of the irradiance over all normals.
     error = (approximate - exact).square().sum((-2, -1)).sqrt()
-    norm = exact.square().sum((-2, -1)).sqrt()
-    return torch.where(error > 0, error / norm, error)
+    return torch.where(error > 0, error / exact.square().sum((-2, -1)).sqrt(), error)
 
 
 def quadrature(degree: int) -> tuple[Float64[Tensor, "N 3"], Float64[Tensor, " N"]]:
@@ -543,9 +542,8 @@ def rotate(coefficients: Tensor, rotation: Float[Tensor, "3 3"]) -> Tensor:
     rotation = as_tensor("rotation", rotation)
     require_finite(coefficients=coefficients, rotation=rotation)
     degree = _degree_of_rows("coefficients", coefficients)
-    identity = torch.eye(3).to(rotation)
     if rotation.shape != (3, 3) or not torch.allclose(
-        rotation @ rotation.mT, identity, rtol=0, atol=ORTHONORMALITY_TOLERANCE
+        rotation @ rotation.mT, torch.eye(3).to(rotation), rtol=0, atol=ORTHONORMALITY_TOLERANCE
     ):
         raise InputError("rotation is not orthonormal: give an orthonormal matrix of shape (3, 3)")
 

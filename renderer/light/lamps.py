@@ -179,8 +179,7 @@ class Projector(Settings, LocalBasis):
         # The coefficients are irradiances at the origin. Mitsuba needs those at distance 1
         # from the projector, which are larger by the factor distance². Mitsuba
         # itself multiplies them by π.
-        scale = albedo_scale * self.distance**2
-        return [projector(pose_of(camera), self.fov, pattern, scale)]
+        return [projector(pose_of(camera), self.fov, pattern, albedo_scale * self.distance**2)]
 
 
 # A matte surface point casts a ray to each point of a set of points on a disc lamp. A glossy one

@@ -108,8 +108,7 @@ def best_window(
         values = terms.sum(1)
         scale = np.abs(values).max()
         direction, rest, _ = least_distance(terms[:, 1:] / root_weight[1:], -values / scale)
-        weighted_change = direction / rest * scale
-        factors = np.concatenate([[1.0], 1 + weighted_change / root_weight[1:]])
+        factors = np.concatenate([[1.0], 1 + direction / rest * scale / root_weight[1:]])
         # Legendre coefficients of the windowed lobe.
         series = odd_numbers * spectrum * factors
         # The minima of the lobe are at roots of its derivative, or at an end.
@@ -193,8 +192,7 @@ def window_without_ringing(
     degree = math.isqrt(len(coefficients)) - 1
     # The square root, because the width of a highlight is α = roughness².
     narrow_roughness = max(roughness, MIN_ROUGHNESS) * math.sqrt(NARROWER)
-    narrow_amplitudes = torch.from_numpy(_amplitudes(narrow_roughness, degree))
-    narrow_lobe = narrow_amplitudes[bands(degree)]
+    narrow_lobe = torch.from_numpy(_amplitudes(narrow_roughness, degree))[bands(degree)]
     window = torch.ones(len(coefficients), dtype=torch.float64)
     # Number of rows of the map on which the sign of the highlight is tested.
     rows = max(FEWEST_ROWS, 2 * degree)

@@ -230,8 +230,7 @@ def _box_filter(
         values = face_values[entry_to_face] if is_flat else basis.irradiance(surface.normals)
         # The entries of a pixel follow each other, so each sum is over a segment.
         add_up = partial(torch.segment_reduce, reduce="sum", lengths=entry_counts, unsafe=True)
-        rows = torch.stack([add_up(values * weight[:, None]) for weight in weights.T])
-        return rows.mT.to(dtype)
+        return torch.stack([add_up(values * weight[:, None]) for weight in weights.T]).mT.to(dtype)
     transfer = torch.empty(weights.shape[1], len(basis.nonzero), pixel_count, dtype=dtype)
     # Pixel i has the entries from `entry_starts[i]` to `entry_starts[i + 1]` - 1.
     entry_starts = F.pad(entry_counts.cumsum(0), (1, 0))

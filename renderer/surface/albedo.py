@@ -50,8 +50,7 @@ class Texture:
         """
         require_bounded(texture=values)
         # One row for each channel, with all texels in row-major order.
-        channels = values.flatten(0, 1).T
-        return Texture(values.shape[:2], partial(torch.index_select, channels, 1))
+        return Texture(values.shape[:2], partial(torch.index_select, values.flatten(0, 1).T, 1))
 
 
 def surface_albedo(
@@ -362,8 +361,7 @@ def with_added_albedo(
         new_gloss = np.zeros((*charts.sheet_size[::-1], gloss.shape[2]), np.uint8)
         for block in np.array_split(np.arange(len(faces)), 1 + charts.texel_count // SHEET_BLOCK):
             chart, on_sheet, center = charts.texels(block)
-            bytes_of_texels = torch.from_numpy(_texels_at(center, texture)).long()
-            albedo = albedo_of_byte.take(bytes_of_texels)
+            albedo = albedo_of_byte.take(torch.from_numpy(_texels_at(center, texture)).long())
             if mesh.one_color_per_face:
                 albedo *= corner_albedo[faces[chart], 0]
             else:

@@ -232,8 +232,7 @@ def _multiply_bands(rotation: Tensor, coefficients: Tensor) -> Tensor:
 def _axis_permutation(degree: int) -> Tensor:
     """Compute how SH coefficients change if the axes are permuted: x to y, y to z, z to x."""
     identity = torch.eye((degree + 1) ** 2, dtype=torch.float64)
-    permutation = torch.eye(3, dtype=torch.float64).roll(1, 0)
-    return rotate(identity, permutation)
+    return rotate(identity, torch.eye(3, dtype=torch.float64).roll(1, 0))
 
 
 def lobe_functions(
@@ -252,8 +251,7 @@ def lobe_functions(
     in_cosine = _cosine_polynomials(cosine, coefficients.shape[-1])
     in_roughness = roughness_polynomials(roughness)
     if len(roughness) == 1:
-        cosine_coefficients = torch.einsum("tmrc,r->tmc", coefficients, in_roughness[:, 0])
-        return cosine_coefficients @ in_cosine
+        return torch.einsum("tmrc,r->tmc", coefficients, in_roughness[:, 0]) @ in_cosine
     # Axes: polynomial in the roughness, polynomial in the cosine, sample.
     products = in_roughness[:, None] * in_cosine
     return coefficients.flatten(2) @ products.flatten(0, 1)
