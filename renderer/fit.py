@@ -367,12 +367,11 @@ class _Target:
             return self.fit_light(camera_of(parameters))[0].numpy()
 
         def jacobian(parameters: Float[np.ndarray, " 5"]) -> Float[np.ndarray, "N 5"]:
-            columns = []
+            steps = np.array(DERIVATIVE_STEPS) / self.size
             # Row k of the diagonal matrix is a step that changes only parameter k.
-            for step in np.diag(np.array(DERIVATIVE_STEPS) / self.size):
-                difference = residuals(parameters + step) - residuals(parameters - step)
-                columns.append(difference / (2 * step.sum()))
-            return np.stack(columns, axis=1)
+            pairs = [(parameters + step, parameters - step) for step in np.diag(steps)]
+            differences = [residuals(after) - residuals(before) for after, before in pairs]
+            return np.stack(differences, axis=1) / (2 * steps)
 
         # Parameters of the first camera, and the range of each parameter.
         shift = [first.right / first.width, first.up / first.width]
