@@ -208,8 +208,7 @@ class AugmentationService:
             raise InputError("classes is empty: name all classes of the network")
         labels = torch.tensor(names, device=scene.lights.device)
         settings = replace(settings, examples=len(scene))
-        service = (settings, scene, labels, seed, Phases(labels.device))
-        return cls(*service, task=task, classes=classes)
+        return cls(settings, scene, labels, seed, Phases(labels.device), task=task, classes=classes)
 
     def __len__(self) -> int:
         """Return the number of renders that `regenerate` returns."""
@@ -254,8 +253,7 @@ class AugmentationService:
             truth = made.truth or self._truth(problem, made.values)
             return Renders(made.images, self.labels, diagnostics, targets=truth.targets())
         # Classification has no boxes, but a few examples for figures.
-        examples = self._examples(model, problem, made)
-        return Renders(made.images, self.labels, diagnostics, examples)
+        return Renders(made.images, self.labels, diagnostics, self._examples(model, problem, made))
 
     def _examples(self, model: nn.Module, problem: SceneProblem, made: _Made) -> AttackExamples:
         """Render and classify some examples of a successful attack, evenly spaced, for a figure."""
@@ -336,8 +334,7 @@ class AugmentationService:
         shown: list[object] = [self.labels.tolist(), list(self.positive_classes)]
         shown += [] if self.images is None else [tuple(self.images.shape)]
         shown += [] if self.scene is None else [_describe_scene(self.scene)]
-        digest = hashlib.sha256(repr(shown).encode()).digest()
-        return torch.tensor(list(digest), dtype=torch.uint8)
+        return torch.tensor(list(hashlib.sha256(repr(shown).encode()).digest()), dtype=torch.uint8)
 
     def _from_folder(self, model: nn.Module, images: Tensor, number: int) -> Renders:
         """Select the next images of a folder in place of renders, and classify some of them.

@@ -309,9 +309,8 @@ class RandomSearch(Optimizer):
     def ask(self, rows: Int[Tensor, " N"]) -> Float[Tensor, "N 1 D"]:
         """Return a random change of the accepted values."""
         examples = self.examples[rows]
-        shape = self.values.shape[1:]
         generators = map(self._generator, examples.tolist())
-        normal = [torch.randn(shape, generator=draws) for draws in generators]
+        normal = [torch.randn(self.values.shape[1:], generator=draws) for draws in generators]
         # Standard deviation of each change, shape (N, D).
         deviation = self.length[rows] * self.problem.search_scale(examples)
         moved = self.values[rows] + deviation * torch.stack(normal).to(self.values)

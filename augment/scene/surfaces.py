@@ -92,8 +92,7 @@ def spline(
     # A spline has its outer nodes at the border, and linear interpolation at centers of cells.
     corners = True if mode == "bicubic" else None
     # Column i of the matrix is the interpolation of nodes that are 1 at node i and 0 elsewhere.
-    values = F.interpolate(identity, (pixels, 1), mode=mode, align_corners=corners)
-    matrix = values[0, :, :, 0].T
+    matrix = F.interpolate(identity, (pixels, 1), mode=mode, align_corners=corners)[0, :, :, 0].T
     if spacing:
         matrix = _slope(matrix, spacing, 0)
     return matrix.to(device, dtype).contiguous()

@@ -380,8 +380,7 @@ class _Silhouettes:
         # Of all cuts between the same two samples, keep the one with the smallest distance.
         for keys in (distance, after):
             order = order[keys[order].argsort(stable=True)]
-        is_first = after[order].diff(prepend=after.new_tensor([-1])) != 0
-        kept = order[is_first]
+        kept = order[after[order].diff(prepend=after.new_tensor([-1])) != 0]
         edge = edge[kept]
         horizontal = torch.full_like(edge, axis == X, dtype=torch.bool)
         of_edges = self.ends[:, edge], fraction[kept], self.normal[:, edge]

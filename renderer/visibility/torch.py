@@ -92,8 +92,7 @@ def to_fixed_point(
     # rounded to float32. x points to the right and y down. A tensor of constants would be copied
     # to the GPU.
     x, y = points[..., :2].float().to(points.dtype).unbind(-1)
-    coordinates = x * (columns / 2) + columns / 2, y * (-columns / 2) + rows / 2
-    window = torch.stack(coordinates, dim=-1)
+    window = torch.stack([x * (columns / 2) + columns / 2, y * (-columns / 2) + rows / 2], dim=-1)
     positions = (window.float() * SUBSAMPLES).round().long() - SUBSAMPLES // 2
     return positions, (points[..., 2] + 1) / 2 * FAR
 

@@ -70,9 +70,8 @@ class Light(Parameter):
         if not self._nonnegative:
             return super().project_feasible(values, within)
         # RGB of each of the K coefficients, shape (E, K, 3).
-        coefficients = values.unflatten(1, (-1, 3))
         ball = None if within is None else within.unflatten(-1, 3)
-        return self._basis.nearest_nonnegative(coefficients, ball).flatten(1)
+        return self._basis.nearest_nonnegative(values.unflatten(1, (-1, 3)), ball).flatten(1)
 
 
 def replace_light(
