@@ -135,10 +135,9 @@ def unwrapped(network: Any, own_alone: bool = False) -> Any:
         return unwrapped(network.network, own_alone)
     if own_alone:
         return network
-    if isinstance(network, nn.DataParallel | nn.parallel.DistributedDataParallel):
-        return unwrapped(network.module)
-    # `torch.compile` keeps the network under this name.
-    inner = getattr(network, "_orig_mod", None)
+    is_parallel = isinstance(network, nn.DataParallel | nn.parallel.DistributedDataParallel)
+    # `torch.compile` keeps the network under the name _orig_mod.
+    inner = network.module if is_parallel else getattr(network, "_orig_mod", None)
     return network if inner is None else unwrapped(inner)
 
 
