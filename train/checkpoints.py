@@ -10,7 +10,7 @@ import hashlib
 import io
 import json
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -139,8 +139,7 @@ def load_network(
     path = Path(name)
     # weights.pt alone is no network. It lies in the folder of its run.
     folder = path.parent if path.name == WEIGHTS else path
-    is_run = (folder / BEST).is_file() or (published_folder(folder) / PUBLISHED).is_file()
-    if name and is_run:
+    if name and ((folder / BEST).is_file() or (published_folder(folder) / PUBLISHED).is_file()):
         name = f"{RUN}{folder}"
     if not name.startswith(RUN):
         options = {"normalize_light": normalize_light, "trust_code": trust_code}
@@ -297,10 +296,9 @@ def lacks_architecture(path: Path) -> bool:
 
     `torch.save(network.state_dict(), path)` writes such a file.
     """
-    try:
+    with suppress(Exception):  # `torch.load` raises errors of many types for other files.
         return "architecture" not in torch.load(path, map_location="cpu", weights_only=True)
-    except Exception:  # `torch.load` raises errors of many types for other files.
-        return False
+    return False
 
 
 def load_selected(run: Path) -> tuple[Path, dict[str, Any]]:

@@ -9,7 +9,7 @@ import platform
 import signal
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -66,12 +66,11 @@ def most_threads() -> int:
     """
     has_affinity = hasattr(os, "sched_getaffinity")
     bound = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
-    try:
+    permitted = bound
+    # Without a limit, the file of the container's quota is missing, or contains "max 100000".
+    with suppress(OSError, ValueError):
         quota, period = QUOTA.read_text().split()
         permitted = max(1, int(quota) // int(period))
-    except (OSError, ValueError):
-        # Without a limit, the file of the container's quota is missing, or contains "max 100000".
-        permitted = bound
     return min(THREADS, bound, permitted)
 
 
@@ -122,8 +121,7 @@ def choose_precision(precision: str, device: torch.device, trained: nn.Module | 
     modules = [] if is_gpu or trained is None else trained.modules()
     layers = [module for module in modules if isinstance(module, nn.Conv2d)]
     # A depthwise convolution has as many groups as input channels, and more than one.
-    has_depthwise = any(layer.groups == layer.in_channels > 1 for layer in layers)
-    if is_native and not has_depthwise:
+    if is_native and not any(layer.groups == layer.in_channels > 1 for layer in layers):
         return "bfloat16"
     return "float16" if is_gpu else "float32"
 

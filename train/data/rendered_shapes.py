@@ -6,6 +6,7 @@ It is rendered when it is first used, so that training needs no download, and is
 import io
 import math
 import os
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -100,13 +101,11 @@ def load_shapes(train: int, test: int, size: int, seed: int, cache: Path | None 
 
 def read_cached(cache: Path, key: str) -> Tensor | None:
     """Read a tensor from a folder. None if there is no such file, or if it is damaged."""
-    try:
-        # zipfile compares the checksum of the array.
-        with open(cache / f"{key}.npz", "rb") as file, np.load(file) as archive:
-            return torch.from_numpy(archive["images"])
-    # zipfile and NumPy raise errors of many types for a damaged file.
-    except Exception:
-        return None
+    # zipfile compares the checksum of the array. It and NumPy raise errors of many types for a
+    # damaged file.
+    with suppress(Exception), open(cache / f"{key}.npz", "rb") as file, np.load(file) as archive:
+        return torch.from_numpy(archive["images"])
+    return None
 
 
 def write_cached(cache: Path, key: str, images: Tensor) -> None:

@@ -293,10 +293,9 @@ class Run:
         try:
             if not (self._is_resumed and is_laboratory(folder, settings)):
                 write_laboratory(settings)
+            self.scored_folders = {LABORATORY: folder}
         except InputError as error:
             console.warning("no renders are kept aside: %s", error)
-        else:
-            self.scored_folders = {LABORATORY: folder}
 
     def _score(self) -> dict[str, float]:
         """Score the network after the last epoch and the selected one, whose weights remain."""
