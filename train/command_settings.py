@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from augment import augmentation_settings as augmentation
-from augment import settings as scenes
 from augment.attack_settings import PARAMETER_NAMES, AttackSettings, RelightingSettings
-from augment.settings import RendererSettings, SceneSettings
+from augment.settings import AUTO, PYTHON, RendererSettings, SceneSettings
 from renderer import errors
 from renderer import settings as base
 from renderer.errors import MAX_SCALE, MAX_SEED, InputError, is_number
@@ -307,7 +306,7 @@ class EvaluateSettings(TaskSettings):
         if self.label is not None:
             common.label_names(self.label)  # This call only checks the label.
         # With `run`, `network` may only name the function that built the network of the run.
-        builds_run = (self.network or "").startswith(scenes.PYTHON)
+        builds_run = (self.network or "").startswith(PYTHON)
         if (self.run is None) == (self.network is None) and not (self.run and builds_run):
             raise InputError(f"run={self.run} and network={self.network} do not match: give one")
 
@@ -405,7 +404,7 @@ class RenderSettings(TaskSettings):
     )
     scene: SceneSettings = setting(
         lambda: SceneSettings(
-            backgrounds=[0.1, 0.3, 0.5, 0.7, 0.9], views=12, fov=30.0, exposure=scenes.AUTO
+            backgrounds=[0.1, 0.3, 0.5, 0.7, 0.9], views=12, fov=30.0, exposure=AUTO
         ),
         "The scene. light=NAME is short for scene.light=NAME.",
     )

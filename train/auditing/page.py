@@ -12,9 +12,8 @@ from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from train.auditing import lights
 from train.auditing import network as audited
-from train.auditing.lights import ADDITIONAL_STEPS, KINDS, NORMALIZED, SIDE, STEPS
+from train.auditing.lights import ADDITIONAL_STEPS, BOXED, DETECTED, KINDS, NORMALIZED, SIDE, STEPS
 from train.auditing.network import IN_WORDS, AuditedNetwork, AuditReport, Recommendation
 from train.auditing.relit import relit_sections, screen_of_photographs
 from train.results import compare, first_screen
@@ -353,15 +352,15 @@ def detection_sections(networks: Mapping[str, Path], label: str) -> list[dict[st
     """Make a section of a report about each network, whose results are in a folder."""
     made = []
     for name, folder in networks.items():
-        if not (folder / lights.DETECTED).exists():
+        if not (folder / DETECTED).exists():
             continue
-        content = read_json(folder / lights.DETECTED)
+        content = read_json(folder / DETECTED)
         tables = [_metrics_table(content["metrics"], "renders; 95% intervals over views", "light")]
         # The same network with the remedy "normalized light", which may have scores, too.
         normalized = folder.with_name(f"{folder.name}{NORMALIZED}")
         for path, end in ((folder, ""), (normalized, ", with normalized light")):
-            if (path / lights.BOXED / SUMMARY).exists():
-                by_label = read_json(path / lights.BOXED / SUMMARY)["by_label"]
+            if (path / BOXED / SUMMARY).exists():
+                by_label = read_json(path / BOXED / SUMMARY)["by_label"]
                 tables.append(_metrics_table(by_label, f"photographs{end}", "class"))
         chart = plot_curves({name: [content["curve"]]}, "recall", "false detections per image")
         # The curve of a detector that finds nothing is empty, like that of a segmenter.

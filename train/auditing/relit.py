@@ -10,7 +10,7 @@ its only test.
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from augment import photographs as relighting
 from augment.attack_settings import RelightingSettings
 from augment.classifier import TaskNetwork
 from augment.network import device_of
-from augment.photographs import PhotographAttackResult
+from augment.photographs import ADVERSARIAL, RANDOM, SLIDE, UNCHANGED, PhotographAttackResult
 from augment.tasks.task import NOTHING
 from renderer.errors import ShortRepr
 from renderer.image import to_unit
@@ -57,17 +57,12 @@ MAX_PICTURE_WIDTH = 900
 PASS_THRESHOLD = 0.9
 
 
-class _Words(NamedTuple):
-    """A kind of light in a table, and in a sentence."""
-
-    title: str
-    clause: str
-
-
-WORDS = {
-    relighting.SLIDE: _Words("random slide", "under a random slide"),
-    relighting.RANDOM: _Words("random search", "after random search"),
-    relighting.ADVERSARIAL: _Words("gradient", "after the gradient attack"),
+# Each kind of light in a table, and in a sentence.
+TITLES = {SLIDE: "random slide", RANDOM: "random search", ADVERSARIAL: "gradient"}
+CLAUSES = {
+    SLIDE: "under a random slide",
+    RANDOM: "after random search",
+    ADVERSARIAL: "after the gradient attack",
 }
 
 
@@ -152,7 +147,7 @@ class RelitScores(ShortRepr):
         A row has the number of photographs with the predicted class and, for each kind of light,
         the number that keep it. The classes that lose most photographs come first.
         """
-        kept = [[WORDS[light].title, format_fraction(self.kept(light))] for light in self.lights]
+        kept = [[TITLES[light], format_fraction(self.kept(light))] for light in self.lights]
         groups: dict[str, list[RelitPhotograph]] = {}
         for item in sorted(self.photographs, key=lambda item: item.predicted):
             groups.setdefault(item.predicted, []).append(item)
@@ -162,7 +157,7 @@ class RelitScores(ShortRepr):
             rows.append([name, len(group), *counts])
         # The class that loses the largest part comes first.
         rows.sort(key=lambda row: sum(row[2:]) / row[1])
-        titles = [f"kept: {WORDS[light].title}" for light in self.lights]
+        titles = [f"kept: {TITLES[light]}" for light in self.lights]
         subject, _ = self.finds
         return [
             Table(f"{subject} that keep their class", ["light", "kept"], kept),
@@ -171,7 +166,7 @@ class RelitScores(ShortRepr):
 
     def sentence(self, name: str) -> str:
         """Write how many photographs keep their class in each kind of light for a network."""
-        counts = [f"{self.kept(light).hits} {WORDS[light].clause}" for light in self.lights]
+        counts = [f"{self.kept(light).hits} {CLAUSES[light]}" for light in self.lights]
         subject, keeps = self.finds
         place = f" in {self.shown} photographs" if subject != "photographs" else ""
         kept = join_words(counts, "and")
@@ -239,7 +234,7 @@ def _write_pictures(result: PhotographAttackResult, out: Path) -> dict[int, str]
     for photograph in order[:PICTURE_COUNT].tolist():
         # The first slide that changes the class in the strongest light, or 0.
         slide = int(changed_in_strongest[photograph].int().argmax())
-        shown = [(relighting.UNCHANGED, 0), *((light, slide) for light in result.changed)]
+        shown = [(UNCHANGED, 0), *((light, slide) for light in result.changed)]
         images = [_drawn(result, result.image(photograph, *item)) for item in shown]
         names[photograph] = f"relit_{photograph:04d}.png"
         write_image(out / names[photograph], torch.cat(images, dim=2))
@@ -263,10 +258,10 @@ def screen_of_photographs(results: Mapping[str, Path]) -> FirstScreen:
     for light in first.lights:
         if light in last.lights:
             before = first.kept(light) if len(scores) > 1 else None
-            title = f"Kept {WORDS[light].clause}"
+            title = f"Kept {CLAUSES[light]}"
             numbers.append(ShownMetric(title, "higher is better", before, last.kept(light)))
     answer = "Random slides seldom change its predictions."
-    kept = last.kept(relighting.SLIDE).value
+    kept = last.kept(SLIDE).value
     if kept is not None and kept < PASS_THRESHOLD:
         answer = "Its predictions depend on the light."
     sentences = [item.sentence(name) for name, item in zip(results, scores, strict=True)]
@@ -300,7 +295,7 @@ def relit_sections(results: Mapping[str, Path]) -> list[dict[str, Any]]:
             item = scores.photographs[index]
             # The predicted class in each light, from left to right.
             shown = [f"unchanged: {item.predicted}"]
-            shown += [f"{WORDS[key].title}: {names[0]}" for key, names in item.becomes.items()]
+            shown += [f"{TITLES[key]}: {names[0]}" for key, names in item.becomes.items()]
             caption = f"{item.path}. {'; '.join(shown)}"
             pictures += read_pictures(folder / file, caption, MAX_PICTURE_WIDTH, caption)
         content = {"sentences": sentences, "tables": scores.tables(), "pictures": pictures}
