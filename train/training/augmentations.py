@@ -20,7 +20,7 @@ from augment.attacks.loop import minimize_from
 from augment.attacks.objective import Objective, as_jpeg
 from augment.attacks.optimizers import Gradient, NormBalls
 from augment.photographs import RelitPhotographs
-from augment.random_streams import generator, stream_seed
+from augment.random_streams import generator, seeded, stream_seed
 from augment.scene.patterns import draw_projected_light
 from augment.tasks.classification import ClassCriterion, label_loss
 from renderer.errors import MAX_SCALE
@@ -52,8 +52,7 @@ def darken(images: Images, seed: int) -> Images:
     widest = max(images.shape[2:]) / 90
     smooth = v2.GaussianBlur(2 * round(1.6 * widest) + 1, (0.04 * widest, widest))
     camera = v2.Compose([smooth, v2.ColorJitter(contrast=(1.0, 1.6))])
-    with torch.random.fork_rng(devices=[images.device] if images.is_cuda else []):
-        torch.manual_seed(seed)
+    with seeded(seed):
         # Only a CPU writes JPEG.
         developed = torch.stack([to_unit(camera(image)) for image in images.cpu()])
         qualities = torch.randint(60, 98, (len(images),)).tolist()
