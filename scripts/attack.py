@@ -16,8 +16,7 @@ def list_parameters(words: list[str]) -> list[str]:
     for word in words:
         found = re.fullmatch(r"attack=(?!\[)(.*)", word)
         rewritten.append(f"attack=[{found[1].replace('+', ',')}]" if found else word)
-    shows_only = "reload" in keys and "attack" not in keys
-    return [*rewritten, "attack=[]"] if shows_only else rewritten
+    return [*rewritten, "attack=[]"] if "reload" in keys and "attack" not in keys else rewritten
 
 
 main = Command(

@@ -297,8 +297,7 @@ def format_facts(kind: type, name: str) -> str:
     """
     facts = facts_of(kind, name)
     limits = [f"{sign} {end:g}" for _, sign, _, end in facts.limits]
-    notes = [" | ".join(facts.choices), facts.unit, ", ".join(limits)]
-    given = "; ".join(filter(None, notes))
+    given = "; ".join(filter(None, [" | ".join(facts.choices), facts.unit, ", ".join(limits)]))
     return f"{facts.about} [{given}]" if given else facts.about
 
 
@@ -401,8 +400,7 @@ def _as_text(value: str) -> str:
     if isinstance(parsed, list | Sweep) and not set("[](){}" + QUOTES) & set(inner):
         members = ",".join(_as_text(item.strip()) for item in inner.split(","))
         return f"[{members}]" if is_list else members
-    is_changed = isinstance(parsed, str | int | float) and parsed != value
-    return quoted(value) if is_changed else value
+    return quoted(value) if isinstance(parsed, str | int | float) and parsed != value else value
 
 
 def _as_list(value: str, is_text: bool) -> str:
@@ -464,8 +462,7 @@ def explain(error: BaseException, keys: Mapping[str, Any], words: Sequence[str])
         # names the group. For a setting in such a group, it names nothing.
         named = re.search(r"full_key: (\S+)", str(wrong))
         parents = [word.partition("=")[0].rpartition(".")[0] for word in words]
-        groups = [named[1]] if named else parents
-        types = {group: keys.get(group) for group in groups}
+        types = {group: keys.get(group) for group in ([named[1]] if named else parents)}
         null = [group for group, kind in types.items() if NoneType in get_args(kind)]
         unset = [group for group in null if is_dataclass(without_none(types[group]))]
         return f"{unset[0]} is null: choose it first, as --help shows" if unset else None

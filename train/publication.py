@@ -77,8 +77,7 @@ def load(name: str) -> PublishedNetwork | PublishedDetector:
     folder = published_folder(PRETRAINED / name)
     loaded = load_run(folder)
     # The scores of a classifier are metrics by name, those of a detector are in groups of images.
-    _, state = load_selected(folder)
-    scores = state["scores"]
+    scores = load_selected(folder)[1]["scores"]
     facts = loaded.network, loaded.size, loaded.classes, name
     network: PublishedNetwork | PublishedDetector
     if isinstance(loaded, Classifier):
@@ -172,8 +171,7 @@ def publish(
     points: list[OperatingPoint] = []
     # A Python function of the user may build the network. It is called only if the
     # network must be calibrated.
-    is_python = str(state["architecture"].get("name")).startswith(PYTHON)
-    if calibrate is not None or not is_python:
+    if calibrate is not None or not str(state["architecture"].get("name")).startswith(PYTHON):
         # `load_run` raises an InputError if nobody could load the published network.
         loaded = load_run(path, model=network, trust_code=trust_code)
         if calibrate is not None and false_positive_rate is not None:

@@ -476,8 +476,7 @@ def write_sweeps(sweeps: Mapping[str, Sweep], norms: Mapping[str, str], out: Pat
         for row in sweep
     ]
     # The header, and a row for each record.
-    cells = [[*records[0]], *([*record.values()] for record in records)]
-    write_csv(out / SWEEP_TABLE, cells, line_end="\r\n")
+    write_csv(out / SWEEP_TABLE, [records[0], *map(dict.values, records)], line_end="\r\n")
     # The last mesh is "all" if there are several.
     shown = [record for record in records if record["mesh"] == records[-1]["mesh"] and record["n"]]
     _draw_sweep(shown, norms, out / SWEEP_FIGURE)

@@ -187,8 +187,7 @@ def harden(
             raise InputError(f"{fault}: give an nb.Classifier instead", "train.recognize")
         for name in UNFIT_SETTINGS if is_detector else ():
             value = getattr(settings.train, name)
-            is_unfit = value in UNFIT_TEXTS if isinstance(value, str) else bool(value)
-            if is_unfit:
+            if value in UNFIT_TEXTS if isinstance(value, str) else value:
                 fault = f"train.{name}={value} is for classifiers"
                 raise InputError(f"{fault}: choose another value", f"train.{name}")
         require_new_run(folder, "out", overwrite, settings.train.resume)

@@ -15,8 +15,6 @@ def run(settings: ReportSettings) -> None:
     out = Path(settings.out or parent)
     # An earlier report in the common folder of all runs is replaced, unless it is the
     # report of an audit.
-    own_files: list[str] = []
-    if out.resolve() == parent.resolve():
-        own_files = [pattern for pattern in RESULTS if pattern not in OF_AUDIT]
+    own_files = {*RESULTS}.difference(OF_AUDIT) if out.resolve() == parent.resolve() else ()
     page, _ = write_report(folders, output_folder(out, settings.overwrite, own_files))
     print(f"report: {page} ({page.stat().st_size / 1e6:.1f} MB)")
