@@ -338,9 +338,8 @@ def frames_of(result: AttackResult, example: int) -> dict[str, Any]:
     same light), both JPEG in base64, "probabilities" of these classes, and "predicted".
     """
     start, end = result.problem.start[example], result.minimum.values[example]
-    # Shape (FRAME_COUNT, 1): 0 is the start and 1 the end of the attack.
-    weights = torch.linspace(0, 1, FRAME_COUNT).to(start)[:, None]
-    values = start + weights * (end - start)
+    # Shape (FRAME_COUNT, D), from the start to the end of the attack.
+    values = start + torch.linspace(0, 1, FRAME_COUNT).to(start)[:, None] * (end - start)
     # All frames are of the same example.
     examples = torch.full((FRAME_COUNT,), example, device=start.device)
     with torch.no_grad():

@@ -234,10 +234,9 @@ def _read_coco(file: Path) -> Annotations:
             if box.shape != (4,) or not (np.isfinite(box).all() and (box[2:] >= 0).all()):
                 raise ValueError(f"an annotation has the bbox {item['bbox']}")
             label = classes.index(names[item["category_id"]])
-            # COCO gives left, top, width and height. The result is left, top, right and bottom.
-            corners = (*box[:2], *(box[:2] + box[2:]))
             is_crowd = str(item.get("iscrowd") or 0).lower() not in {"0", "0.0", "false"}
-            rows[item["image_id"]].append((label, *corners, is_crowd))
+            # COCO gives left, top, width and height. The result is left, top, right and bottom.
+            rows[item["image_id"]].append((label, *box[:2], *(box[:2] + box[2:]), is_crowd))
         paths = _find_images(file, names_of_images)
         missing = [name for name in names_of_images if name not in paths]
         photographs = []
@@ -520,8 +519,7 @@ def _upright_boxes(photograph: Annotated, upright: Float[np.ndarray, "2"]) -> np
 
 def _is_similar(one: Float[np.ndarray, "2"], other: Float[np.ndarray, "2"]) -> bool:
     """Return whether two images have about the same aspect ratio."""
-    ratio = one[0] * other[1] / (one[1] * other[0])
-    return bool(1 / MAX_RATIO <= ratio <= MAX_RATIO)
+    return bool(1 / MAX_RATIO <= one[0] * other[1] / (one[1] * other[0]) <= MAX_RATIO)
 
 
 def fit_batches(

@@ -184,11 +184,10 @@ def crop_and_flip(
     source_columns = torch.arange(width, device=device).expand(len(chosen), -1)
     source_columns = torch.where(flips[:, None], source_columns.flip(1), source_columns)
     source_columns = _reflect(source_columns + shifts[1, :, None], width)
-    channels = torch.arange(images.shape[1], device=device)
     # The four index arrays broadcast to the shape (B, C, H, W) of the result.
     return images[
         chosen[:, None, None, None],
-        channels[:, None, None],
+        torch.arange(images.shape[1], device=device)[:, None, None],
         source_rows[:, None, :, None],
         source_columns[:, None, None, :],
     ]

@@ -225,9 +225,8 @@ class WebDataset(DataSet):
         label = first_label(render)
         number = self.classes.index(label) if label in self.classes else -1
         for name, content in (self.files(render) | {f"{key}.cls": str(number)}).items():
-            name = name.removeprefix(f"{DETAILS}/").replace(f"{key}_", f"{key}.")
             data = content.encode() if isinstance(content, str) else content
-            info = tarfile.TarInfo(name)
+            info = tarfile.TarInfo(name.removeprefix(f"{DETAILS}/").replace(f"{key}_", f"{key}."))
             info.size = len(data)
             tar.addfile(info, io.BytesIO(data))
 
@@ -268,8 +267,7 @@ def _map(render: LabeledRender, name: str) -> np.ndarray:
     if name == "depth":
         scale = _depth_scale(render.depth) or 1.0
         return np.rint(render.depth.numpy() / scale).astype(np.uint16)
-    normals = render.normals.permute(1, 2, 0).numpy()
-    return np.rint((normals + 1) / 2 * 255).astype(np.uint8)
+    return np.rint((render.normals.permute(1, 2, 0).numpy() + 1) / 2 * 255).astype(np.uint8)
 
 
 def png(pixels: Tensor | np.ndarray) -> bytes:

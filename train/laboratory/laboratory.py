@@ -239,9 +239,8 @@ def draw_shots(
         radiance = None
         if lighting in environments:
             radiance = _scale_environment(environments[lighting], brightness, rng)
-        values: tuple[Any, ...] = (patterns, ambient, table, projectors, camera, center)
-        values += (aim, rotation, scale, roughness, wall, radiance)
-        yield Shot(lighting, brightness, *values)
+        shown = patterns, ambient, table, projectors, camera, center, aim, rotation
+        yield Shot(lighting, brightness, *shown, scale, roughness, wall, radiance)
 
 
 def _scale_environment(radiance: Panorama, brightness: float, rng: np.random.Generator) -> Panorama:

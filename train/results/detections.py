@@ -302,8 +302,6 @@ def mean_iou(
             # IoU = intersection / (predicted + true - intersection).
             return shared / (counts @ (guesses + truths) - shared)
 
-    def mean(counts: np.ndarray) -> np.ndarray:
-        return np.nanmean(by_class(counts), axis=-1)
-
-    interval = estimate(mean, [np.arange(len(counted))], units)
-    return interval, by_class(np.ones((1, len(counted))))[0].tolist()
+    groups = [np.arange(len(counted))]
+    miou = estimate(lambda counts: np.nanmean(by_class(counts), axis=-1), groups, units)
+    return miou, by_class(np.ones((1, len(counted))))[0].tolist()

@@ -219,9 +219,8 @@ def _describe_images(pool: Pool, labels: Sequence[str]) -> str:
     # Without the names of the objects, the interval is over images.
     counts = (scored.positive_objects, len({*others.values()} - {None}) or len(others))
     objects = ["" if scored.over == tables.IMAGES else f" ({count:,} objects)" for count in counts]
-    positives = f"{scored.positives:,} images of {label}{objects[0]}"
     negatives = f"{len(others):,} of other objects{objects[1]}"
-    text = f"Scored on {positives} and {negatives}."
+    text = f"Scored on {scored.positives:,} images of {label}{objects[0]} and {negatives}."
     if len(labels) > 1:
         text += " For each class, the images of the other classes count as other objects, too."
     return text

@@ -367,8 +367,7 @@ def thresholds(
     thresholds_by_rate = []
     # A float would be inexact: 0.29 * 100 is less than 29 and would become 28.
     for rate in map(fractions.Fraction, rates):
-        allowed_above = rate.numerator * total // rate.denominator
-        needed_up_to = total - allowed_above
+        needed_up_to = total - rate.numerator * total // rate.denominator
         # The index is the number of scores that too many negatives exceed.
         index = (counts_up_to < needed_up_to[..., None]).sum(axis=-1)
         thresholds_by_rate.append(negatives[order[index]])

@@ -162,8 +162,7 @@ def with_label(settings: ExperimentSettings) -> ExperimentSettings:
     is_scored = bool(settings.photos) or settings.evaluate.laboratory_setups > 0
     is_used = settings.augment.renders or settings.train.ranking_weight > 0 or is_scored
     has_meshes = bool(settings.meshes) and settings.augment.mode != "folder"
-    follows_from_meshes = settings.label is None and has_meshes and is_used
-    if not (may_have_index or follows_from_meshes):
+    if not (may_have_index or (settings.label is None and has_meshes and is_used)):
         return settings
     initial = load_initial(settings)
     # Without an initial network, `Run` checks the label when it knows the classes of the data.
@@ -361,8 +360,7 @@ def build_service(
         scene = _build_scene(settings, data.size, device, phases)
         labels = torch.tensor([label_of_class[name] for name in scene.labels])
     # If all classes are positive, a render of no positive class shows no class at all.
-    has_all = is_classifier and len(positive_classes) == len(data.classes)
-    if has_all and (labels < 0).any():
+    if is_classifier and len(positive_classes) == len(data.classes) and (labels < 0).any():
         fault = f"label={settings.label} has all classes of the network, but some renders none"
         raise InputError(f"{fault}: give all objects a label, or set hard_negatives=[]")
     rendered = (settings.augment, scene, labels.to(device), settings.seed, phases)

@@ -61,11 +61,10 @@ def fit_recognizer(
     measure = partial(statistics, network, layers)
     # The light is shown as often as other lights.
     others = [other for other in (RELIGHT, LOW_LIGHT, STRIPES) if other not in light]
-    kinds = [*[light] * len(others), *others]
     with eval_mode(network):
         relit = [
             predict(measure, shown, device, seed, index, "recognition", light=kind)
-            for index, kind in enumerate(kinds)
+            for index, kind in enumerate([*[light] * len(others), *others])
         ]
         values = torch.cat([*relit, predict(measure, shown, device)]).double()
         is_lit = torch.arange(len(values)) < len(shown) * len(others)
@@ -83,8 +82,7 @@ def expected_errors(count: int) -> float:
     The threshold is the quantile KEPT of the scores of `count` unchanged images. A further one
     exceeds it with this probability.
     """
-    rank = math.ceil(KEPT * (count - 1))
-    return (count - rank) / (count + 1)
+    return (count - math.ceil(KEPT * (count - 1))) / (count + 1)
 
 
 def logistic_weights(

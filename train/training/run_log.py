@@ -70,9 +70,8 @@ class RunLog:
         `step` is the epoch, which counts from 1. The final scores, after which nothing is logged,
         have the step after the last epoch.
         """
-        line = values if is_final else {"epoch": step, **values}
         with open(self._metrics, "a") as file:
-            file.write(json.dumps(line) + "\n")
+            file.write(json.dumps(values if is_final else {"epoch": step, **values}) + "\n")
         if self._logger is not None:
             self._logger.log(dict(values), step=step)
             return
