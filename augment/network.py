@@ -470,13 +470,15 @@ def device_of(network: object) -> torch.device:
 @contextmanager
 def gradient_flags_kept(network: object) -> Iterator[None]:
     """Restore `requires_grad` of all parameters of a network at the end of a `with` block."""
-    parameters = list(network.parameters()) if isinstance(network, nn.Module) else []
-    flags = [parameter.requires_grad for parameter in parameters]
+    parameters = dict(network.named_parameters()) if isinstance(network, nn.Module) else {}
+    flags = {name: parameter.requires_grad for name, parameter in parameters.items()}
     try:
         yield
     finally:
-        for parameter, flag in zip(parameters, flags, strict=True):
-            parameter.requires_grad_(flag)
+        # The first pass of an FSDP network replaces its parameters.
+        replaced = network.named_parameters() if isinstance(network, nn.Module) else ()
+        for name, parameter in [*parameters.items(), *replaced]:
+            parameter.requires_grad_(flags[name])
 
 
 def own_size(network: object) -> int | None:

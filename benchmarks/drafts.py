@@ -2,7 +2,7 @@
 
     python -m benchmarks.drafts attack=[pose] meshes=[orange_studio.glb] label=orange
     python -m benchmarks.drafts success attack=[pose] meshes=[orange_studio.glb] label=orange \
-        network=run:pretrained/none scene.views=8
+        network=run:pretrained/none scene.views=8 renderer.samples=8
 
 The arguments are those of pnb-attack. Random values of the attacked parameters are rendered by
 turns as a draft and exactly. CPU seconds are those of an image and its gradient, on one thread. The

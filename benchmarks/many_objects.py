@@ -468,11 +468,15 @@ def load_networks(options: argparse.Namespace) -> dict[str, list[Classifier]]:
         # The folder of a seed has its number as its name.
         path = Path(folders[0])
         title = path.parent.name if path.name.isdigit() else path.name
+        if title in networks:
+            raise SystemExit(f"two networks have the title {title}: rename a folder")
         seeds = [load(folder, options.network_size) for folder in folders]
         networks[title] = seeds
         for factor in options.interpolate:
             between = [interpolate(original, trained, factor) for trained in seeds]
             networks[f"{title} × {factor:g}"] = between
+    if options.control not in (None, *networks):
+        raise SystemExit(f"--control {options.control} is none of {', '.join(networks)}")
     return networks
 
 

@@ -427,11 +427,13 @@ class MitsubaStep:
         """Describe the scene with an environment map (rows, columns, 3) for Mitsuba."""
         surface = {"type": "diffuse", "reflectance": {"type": "rgb", "value": list(ALBEDO)}}
         mesh = self.view.mesh
+        sensor = sensor_of(CAMERA, self.view.size)
+        sensor["film"]["pixel_format"] = "rgb"
         return {
             "type": "scene",
             "integrator": integrator(bounces=0),
             "light": environment({"bitmap": texels.numpy()}),
-            "sensor": sensor_of(CAMERA, self.view.size, "rgb"),
+            "sensor": sensor,
             "mesh": shape(self.module, surface, mesh.vertices, mesh.faces),
         }
 

@@ -31,6 +31,8 @@ COUNTERPARTS = {
     "cast_shadow": ("RandomShadow", "albumentations"),
     "linear": ("Illumination", "RandomLinearIllumination"),
     "fractal": ("PlasmaShadow", "RandomPlasmaShadow"),
+    "point": ("Illumination gaussian", "RandomGaussianIllumination"),
+    "color_temperature": ("PlanckianJitter", "RandomPlanckianJitter"),
 }
 # Images, each in a light of its own, over which the errors of random light are computed.
 LIT_IMAGES = 16
@@ -67,13 +69,15 @@ def transforms(size: int) -> dict[str, Callable[[], object]]:
             "RandomShadow": albumentations.RandomShadow(p=1),
             "Illumination": albumentations.Illumination(mode="linear", p=1),
             "PlasmaShadow": albumentations.PlasmaShadow(p=1),
+            "Illumination gaussian": albumentations.Illumination(mode="gaussian", p=1),
+            "PlanckianJitter": albumentations.PlanckianJitter(p=1),
         }
         for name, transform in theirs.items():
             calls[f"Albumentations {name}"] = partial(transform, image=array)
     if find_spec("kornia"):
         import kornia.augmentation
 
-        for name in ("RandomLinearIllumination", "RandomPlasmaShadow"):
+        for name in {name for _, name in COUNTERPARTS.values()} - {"albumentations"}:
             module = getattr(kornia.augmentation, name)(p=1.0)
             calls[f"Kornia {name}"] = partial(module, unit)
     return calls

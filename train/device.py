@@ -351,7 +351,9 @@ class SignalHandler:
     def _note(self, number: int, frame: FrameType | None) -> None:
         """Handle the first signal: note its number, so that the next signal ends the process."""
         self._number = number
-        self._restore()
+        # torchrun passes signals on, also to processes that got them from their job.
+        if "TORCHELASTIC_RUN_ID" not in os.environ:
+            self._restore()
 
     def _restore(self) -> None:
         """Restore the handlers that the signals had before the block."""

@@ -56,7 +56,9 @@ def run_attack(overrides: Sequence[str], threads: int) -> Row:
         environment = os.environ | {"OMP_NUM_THREADS": str(threads)}
         done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
         if done.returncode == REFUSED:
-            return {"refusal": done.stderr.strip().splitlines()[-1]}
+            refusal = done.stderr.strip().splitlines()[-1]
+            print(f"{' '.join(overrides)}: {refusal}", file=sys.stderr)
+            return {"refusal": refusal}
         if done.returncode != 0:
             raise RuntimeError(f"{command} ended with status {done.returncode}: {done.stderr}")
         [file] = Path(folder).glob("out/*/attack.jsonl")

@@ -55,10 +55,11 @@ OFFSET = 1e-5
 # Faces are compared with vertices to find the pixels that need rays. This is the largest
 # number of comparisons, which takes about a second. With more, all pixels cast rays.
 MAX_COMPARISONS = 2**30
-# Largest number of vertices above a face whose horizon is computed.
-MAX_ABOVE = 64
-# Number of comparisons of a face with a vertex that take as long as a ray, or less.
-COMPARISONS_PER_RAY = 8
+# Largest number of faces that rise above a face whose horizon is computed. Each counts once for
+# each of its vertices above.
+MAX_ABOVE = 384
+# The horizons are computed if they need at most this number of comparisons for each ray.
+COMPARISONS_PER_RAY = 4
 # Sines of elevations are compared with this room for rounding.
 ROUNDING = 1e-9
 # The plane of a face may block light that would reach an interpolated normal (smooth
@@ -322,8 +323,8 @@ class Rays:
         horizons = may_hit.double()
         face_of_sample = fragments.sample_to_seen_face
         pixel_count = may_hit[face_of_sample].double().mean() * len(fragments.pixels)
-        ray_count = pixel_count * direction_count
-        if may_hit.sum() * len(self._mesh.vertices) <= COMPARISONS_PER_RAY * ray_count:
+        most = COMPARISONS_PER_RAY * pixel_count * direction_count
+        if 0 < may_hit.sum() * len(self._mesh.vertices) <= most:
             horizons[may_hit] = self._horizons(corners[may_hit], plane_normals[may_hit])
         horizon = horizons[face_of_sample]
         blocks_light = (surface.normals * surface.planes).sum(1) < 1 - 2 * MAX_IGNORED_LIGHT
@@ -337,7 +338,7 @@ class Rays:
 
         If another face lies below a plane of slope t that contains an edge of the seen face and
         rises beyond it, all rays between both have at most the slope t. The edge with the least
-        slope gives the bound. Faces with more than `MAX_ABOVE` vertices above them get 1.
+        slope gives the bound. It is 1 if more than `MAX_ABOVE` faces rise above the face.
         """
         origin = torch.from_numpy(self._mesh.origin)
         corners = corners - origin
@@ -345,6 +346,7 @@ class Rays:
         faces = torch.from_numpy(self._mesh.faces).long()
         entries = np.ones(faces.numel(), bool), (faces.ravel(), np.arange(faces.numel()) // 3)
         faces_of_vertex = csr_matrix(entries, (len(vertices), len(faces)))
+        face_count = np.diff(faces_of_vertex.indptr)
         # The plane of each face, and a plane across it through each edge. Their normals point up
         # and outward. A plane has its normal, and minus the coordinate along it.
         outward = torch.linalg.cross(corners.roll(-1, 1) - corners, normals[:, None])
@@ -357,10 +359,11 @@ class Rays:
         planes = torch.cat([axes, -coordinate], 2)
         horizons = []
         for block in planes.split(8 * BLOCK // len(vertices) + 1):
-            is_above = block[:, 0] @ vertices.T > 0
-            horizon = (is_above.sum(1) > MAX_ABOVE).double()
-            pairs = csr_matrix((is_above & (horizon == 0)[:, None]).numpy()) @ faces_of_vertex
-            row, other = (torch.from_numpy(index).long() for index in pairs.nonzero())
+            above = csr_matrix((block[:, 0] @ vertices.T > 0).numpy())
+            has_few = above @ face_count <= MAX_ABOVE
+            pairs = (above.multiply(has_few[:, None]) @ faces_of_vertex).nonzero()
+            row, other = (torch.from_numpy(index).long() for index in pairs)
+            horizon = torch.from_numpy(~has_few).double()
             # Of the vertices of the other face: height, and distance beyond each edge.
             coordinates = torch.einsum("evd,eld->lev", vertices[faces[other]], block[row])
             height, beyond = coordinates[0], coordinates[1:]

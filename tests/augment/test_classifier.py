@@ -15,7 +15,7 @@ import augment
 import norm_balls as nb
 import renderer
 from augment.classifier import CheckedNetwork, Classifier, as_network, remembering
-from augment.network import ChannelNormalization, Network, say_once
+from augment.network import ChannelNormalization, Network, gradient_flags_kept, say_once
 from renderer import InputError
 from tests.detectors import small_detector
 
@@ -111,6 +111,16 @@ def test_a_network_gets_images_in_its_own_units(network, images, options, expect
     classifier = as_network(network, SIZE, **options)
     torch.testing.assert_close(classifier(images), network(expected(images)))
     assert classifier.classes == ("0", "1", "2")
+
+
+def test_parameters_that_the_first_pass_replaces_learn_after_an_attack():
+    """As `torch.distributed.fsdp.fully_shard` replaces them."""
+    network = nn.Linear(2, 2)
+    network.bias.requires_grad_(False)
+    with gradient_flags_kept(network):
+        network.requires_grad_(False)
+        network.weight = nn.Parameter(network.weight.detach(), requires_grad=False)
+    assert [parameter.requires_grad for parameter in network.parameters()] == [True, False]
 
 
 def test_a_plain_network_is_attacked_like_its_classifier_and_stays_as_it_is(network):

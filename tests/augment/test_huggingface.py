@@ -275,6 +275,12 @@ def test_without_a_processor_the_normalization_is_assumed(save, caplog):
     assert "std (0.5, 0.5, 0.5), assumed" in caplog.text
 
 
+def test_a_processor_that_cuts_images_into_patches_is_refused(save):
+    folder = save(("ViTForImageClassification", SMALL | PATCHES, "Siglip2", {}, SIZE))
+    with pytest.raises(InputError, match="prepares no images"):
+        nb.load_classifier(f"hf:{folder}")
+
+
 def test_missing_weights_are_refused(save, tmp_path):
     import safetensors.torch
 

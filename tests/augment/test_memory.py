@@ -25,11 +25,11 @@ def test_more_than_the_free_memory_of_the_system_and_of_the_group_is_refused(tmp
     require_memory("renders", 2**60, CPU)  # The system does not say how much is free.
     (tmp_path / "meminfo").write_text("MemTotal: 8388608 kB\nMemAvailable: 4194304 kB\n")
     (tmp_path / "memory.max").write_text("max\n")
-    (tmp_path / "memory.current").write_text("5\n")
+    (tmp_path / "memory.current").write_text(f"{2**30}\n")
     require_memory("renders", 2**32, CPU)
     with pytest.raises(InputError, match=r"^renders .* 8\.0 GB .* 4\.0 GB"):
         require_memory("renders", 2**33, CPU)
-    (tmp_path / "memory.max").write_text(f"{2**30 + 5}\n")
+    (tmp_path / "memory.max").write_text(f"{2**31}\n")
     with pytest.raises(InputError, match=r"1\.0 GB"):
         require_memory("renders", 2**32, CPU)
 

@@ -194,6 +194,15 @@ def test_the_end_of_a_worker_by_the_same_signal_ends_the_process_as_the_signal_d
     assert ended.value.code == 128 + signal.SIGINT
 
 
+def test_a_signal_that_torchrun_passes_on_to_a_process_that_has_it_ends_nothing(monkeypatch):
+    monkeypatch.setenv("TORCHELASTIC_RUN_ID", "1")
+    with pytest.raises(Interrupted), SignalHandler() as handler:
+        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
+        assert handler.requested()
+        handler.stop()
+
+
 @pytest.mark.parametrize("error", [None, ZeroDivisionError])
 def test_a_signal_that_is_not_asked_for_acts_at_the_end_and_hides_no_error(error):
     with pytest.raises(error or KeyboardInterrupt), SignalHandler():

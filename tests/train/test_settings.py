@@ -59,6 +59,9 @@ def test_training_takes_the_parameters_of_the_attack_command():
     ("overrides", "start"),
     [
         (["train.epoch=3"], "train.epoch is not a setting: did you mean train.epochs?"),
+        (["batch_size=32"], "batch_size is not a setting: did you mean train.batch_size?"),
+        (["scene.view=3"], "scene.view is not a setting: did you mean scene.views?"),
+        (["tray=3"], "tray is not a setting: --help shows"),
         (["data=mnist"], "data=mnist is not a choice"),
         (["attack@augment.attack=[lightning]"], "attack=lightning is not a choice"),
         (["~seed"], "~seed: a setting cannot be removed"),

@@ -171,7 +171,8 @@ def harden(
         changes |= {"data": {"name": "unlabeled"}, "train": {"device": str(device)}}
         changes |= {"out": str(folder.absolute()), "label": label}
         if is_detector:
-            require_losses(classifier, bool(meshes))
+            with torch.random.fork_rng():
+                require_losses(classifier, bool(meshes))
             if not meshes:
                 changes["augment"] = {"mode": "none"}
         if hard_negatives is not None:

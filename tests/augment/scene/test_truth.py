@@ -16,7 +16,7 @@ from train.settings import read_objects
 
 
 def test_the_mask_of_a_ball_is_its_disc_and_the_box_contains_the_mask():
-    scene = nb.build_scene([("solid:ball", "ball")], size=64, views=2)
+    scene = nb.build_scene([("solid:ball", "ball")], size=32, views=2, width=3.0, samples=8)
     truth = scene.truth({"ball": 7}.__getitem__)
     assert truth.labels.tolist() == [[[7]], [[7]]]
     for view in range(2):
@@ -25,8 +25,8 @@ def test_the_mask_of_a_ball_is_its_disc_and_the_box_contains_the_mask():
         left, top, right, bottom = truth.boxes[view, 0, 0].tolist()
         assert (left, right) == (columns.min(), columns.max() + 1)
         assert (top, bottom) == (rows.min(), rows.max() + 1)
-        # The area of a disc of the width of the box, to the discretization of its border.
-        assert abs(mask.sum() / (math.pi / 4 * (right - left) * (bottom - top)) - 1) < 0.02
+        # A disc of radius 1: half of a pixel must be covered.
+        assert abs(mask.sum() / (math.pi * (32 / 3) ** 2) - 1) < 0.02
     assert truth.visible.eq(1).all()
 
 

@@ -275,7 +275,7 @@ def test_depth_and_normals_of_a_ball_are_those_of_a_sphere(tmp_path):
     normals = torch.stack([x * depth, y * depth, 4 - depth])
     assert (render.normals - normals)[:, inside].abs().max() < 0.05
     assert (render.normals[:, inside].norm(dim=0) - 1).abs().max() < 1e-5
-    # The mask has the pixels of which at least half is covered.
+    # Both maps show the object where the mask does.
     assert torch.equal(render.depth != 0, render.masks[0])
     assert torch.equal((render.normals != 0).any(0), render.masks[0])
 
