@@ -418,8 +418,8 @@ def _find_negative_minima(
         grid_index = grid_index[is_low]
     # SH coefficients of the 3 first and the 9 second derivatives of the light of each start
     # direction. Axes: start, derivative, coefficient.
-    derivatives = lights @ _derivatives(degree)
-    derivatives = derivatives.reshape(len(lights), 3 + 9, -1)[light_index]
+    derivatives = _product(lights, _derivatives(degree)).reshape(len(lights), 3 + 9, -1)
+    derivatives = derivatives[light_index]
     directions = grid_directions[grid_index]
     for _ in range(_NEWTON_STEPS):
         directions = _step_down(directions, derivatives)
