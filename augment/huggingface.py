@@ -83,8 +83,7 @@ def load(model: str, _: Path | None, facts: NetworkFacts, is_random: bool) -> Ta
 
     network = _model(getattr(library, architecture), model, config, name, is_random)
     # What the user gives replaces what the files state.
-    with reading_network(name, "prepares no images (3, height, width)", "use another network"):
-        size, mean, std, is_bgr, *sources = _read_preprocessor(library, model, config)
+    size, mean, std, is_bgr, *sources = _read_preprocessor(library, model, config)
     size = facts.size or size
     if facts.normalization is not None:
         mean, std = mean_and_std(facts.normalization)
@@ -149,6 +148,8 @@ def _read_preprocessor(
         return size, *mean_and_std(IMAGENET), False, sizer, None
     # Images of two sizes become images of one size if the processor resizes to a fixed size.
     shapes = {tuple(prepare((0, 0, 0), side).shape) for side in PROBED}
+    if any(len(shape) != 3 for shape in shapes):
+        raise name_error(f"hf:{model}", "prepares no images of three axes: use another network")
     if source and len(shapes) == 1:
         _, height, width = shapes.pop()
         size, sizer = height if height == width else (height, width), source

@@ -215,7 +215,9 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
         leaves = [leaf for _, leaf in paths]
         keys = [_key_of(path) for path, _ in paths]
         # Keys of leaves that are no images: all but `IMAGES`, if the sample has one of those.
-        hidden = {"depth"} if {*IMAGES}.isdisjoint(keys) else {*keys} - {*IMAGES}
+        kinds = Tensor, Image.Image, np.ndarray
+        named = [key for key, leaf in zip(keys, leaves, strict=True) if isinstance(leaf, kinds)]
+        hidden = {"depth"} if {*IMAGES}.isdisjoint(named) else {*keys} - {*IMAGES}
         # Torchvision tells which of the others are images: the first of plain tensors.
         marked = tv_tensors.Image, tv_tensors.Video
         others = [

@@ -478,7 +478,7 @@ def gradient_flags_kept(network: object) -> Iterator[None]:
         # The first pass of an FSDP network replaces its parameters.
         replaced = network.named_parameters() if isinstance(network, nn.Module) else ()
         for name, parameter in [*parameters.items(), *replaced]:
-            parameter.requires_grad_(flags[name])
+            parameter.requires_grad_(flags.get(name, parameter.requires_grad))
 
 
 def own_size(network: object) -> int | None:

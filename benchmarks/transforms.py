@@ -77,7 +77,7 @@ def transforms(size: int) -> dict[str, Callable[[], object]]:
     if find_spec("kornia"):
         import kornia.augmentation
 
-        for name in {name for _, name in COUNTERPARTS.values()} - {"albumentations"}:
+        for name in sorted({name for _, name in COUNTERPARTS.values()} - {"albumentations"}):
             module = getattr(kornia.augmentation, name)(p=1.0)
             calls[f"Kornia {name}"] = partial(module, unit)
     return calls

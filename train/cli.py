@@ -438,14 +438,13 @@ def explain(error: BaseException, keys: Mapping[str, Any], words: Sequence[str])
     wrong = next((cause for cause in causes(error) if getattr(cause, "full_key", None)), error)
     key = str(getattr(wrong, "full_key", None) or "")
     if isinstance(wrong, ConfigKeyError | ConfigAttributeError):
-        # A group cannot be set. After a typing error, a key of the same name in another group is
-        # the most similar one, above all in few groups.
-        name = key.rpartition(".")[2]
-        known = [one for one in keys if not any(each.startswith(f"{one}.") for each in keys)]
-        moved = [one for one in known if one.rpartition(".")[2] == name]
-        moved.sort(key=lambda one: one.count("."))
-        close = get_close_matches(key, known, 1, 0.9) or moved
-        close = close or get_close_matches(key, known, 1, 0.8)
+        # After a typing error, a key of a similar name in another group is the most similar one,
+        # and of several the first with the fewest groups.
+        deepest_first = sorted([*keys][::-1], key=lambda known: -known.count("."))
+        by_name = {known.rpartition(".")[2]: known for known in deepest_first}
+        names = get_close_matches(key.rpartition(".")[2], by_name, 1, 0.8)
+        close = get_close_matches(key, keys, 1, 0.9) or [by_name[name] for name in names]
+        close = close or get_close_matches(key, keys, 1, 0.75)
         advice = f"did you mean {close[0]}?" if close else "--help shows all settings"
         return f"{key} is not a setting: {advice}"
     if isinstance(wrong, MissingConfigException) and wrong.missing_cfg_file:

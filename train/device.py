@@ -284,8 +284,8 @@ class SignalHandler:
 
     The first signal in the block is only noted. The block asks for it with `requested`, writes a
     checkpoint, and ends the process with `stop`. If it does not, the noted signal takes effect at
-    the end of the block. A second signal ends the process at once. Signals that the process
-    ignores stay ignored. Only the main thread can receive signals.
+    the end of the block. Except under torchrun, a second signal ends the process at once. Signals
+    that the process ignores stay ignored. Only the main thread can receive signals.
     """
 
     def __init__(self) -> None:
@@ -343,14 +343,15 @@ class SignalHandler:
         """
         # `_number` is None if other processes of the run got a signal, but not this process.
         # This process then ends as if it got SIGTERM.
+        self._restore()
         number = self._number or signal.SIGTERM
         if number == BATCH_SYSTEM and callable(signal.getsignal(number)):
             signal.raise_signal(number)
         raise Interrupted(number)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        """Handle the first signal: note its number, so that the next signal ends the process."""
-        self._number = number
+        """Note the first signal. Except under torchrun, the next one ends the process."""
+        self._number = self._number or number
         # torchrun passes signals on, also to processes that got them from their job.
         if "TORCHELASTIC_RUN_ID" not in os.environ:
             self._restore()

@@ -231,13 +231,13 @@ class Lamps(LocalBasis):
         positions = as_array("positions", self.positions)
         is_triple = positions.shape[1:] == (3,) and (positions != 0).any(axis=1).all()
         if not is_triple or not (np.abs(positions) <= MAX_SCALE).all():
-            fault = f"positions={self.positions} are no positions of lamps"
+            fault = f"lamps.positions={self.positions} are no positions of lamps"
             limits = f"with magnitudes up to {MAX_SCALE:g}, and no lamp at the origin"
-            raise InputError(f"{fault}: give [x, y, z] for each lamp, {limits}", "positions")
+            raise InputError(f"{fault}: give [x, y, z] for each lamp, {limits}")
         # Plain assignment to a field of a frozen dataclass raises an error.
         object.__setattr__(self, "positions", tuple(map(tuple, positions.tolist())))
-        require_number("power", self.power, 1 / MAX_SCALE, MAX_SCALE)
-        require_number("radius", self.radius, 0, MAX_SCALE)
+        require_number("lamps.power", self.power, 1 / MAX_SCALE, MAX_SCALE)
+        require_number("lamps.radius", self.radius, 0, MAX_SCALE)
 
     @classmethod
     def from_settings(cls, settings: Any) -> tuple[Self, Tensor]:

@@ -55,6 +55,9 @@ OFFSET = 1e-5
 # Faces are compared with vertices to find the pixels that need rays. This is the largest
 # number of comparisons, which takes about a second. With more, all pixels cast rays.
 MAX_COMPARISONS = 2**30
+# Largest height of the mesh above a face whose horizon is computed, as a fraction of the largest
+# vertex coordinate.
+MAX_RISE = 0.1
 # Largest number of faces that rise above a face whose horizon is computed. Each counts once for
 # each of its vertices above.
 MAX_ABOVE = 384
@@ -256,8 +259,8 @@ class Rays:
                 height = cosine if normals is planes else at_places @ planes[sample].mT
                 is_in_front = cosine > 0
                 # A ray is only cast above the face, and if it may hit another face.
-                may_hit = (height > 0) & (height <= horizon[sample][:, None])
-                cast = torch.nonzero(is_in_front & may_hit)
+                is_low = (height > 0) & (height <= horizon[sample][:, None])
+                cast = torch.nonzero(is_in_front & is_low)
                 place, turn, row = cast.T
                 origins = starts[sample[place, row]]
                 face = self.first_hit(origins, in_turns[turn * places + place])
@@ -319,14 +322,16 @@ class Rays:
         corners = surface.vertices[fragments.corners]
         # Height of the face itself along its normal.
         height_of_face = (plane_normals * corners[:, 0]).sum(1)
-        may_hit = highest - height_of_face > self.offset
-        horizons = may_hit.double()
+        rise = (highest - height_of_face) / self.offset
+        sines = (rise > 1).double()
+        # Little of the mesh rises above these faces, so their horizons are low and soon found.
+        is_low = (rise > 1) & (rise < MAX_RISE / OFFSET)
         face_of_sample = fragments.sample_to_seen_face
-        pixel_count = may_hit[face_of_sample].double().mean() * len(fragments.pixels)
+        pixel_count = is_low[face_of_sample].double().mean() * len(fragments.pixels)
         most = COMPARISONS_PER_RAY * pixel_count * direction_count
-        if 0 < may_hit.sum() * len(self._mesh.vertices) <= most:
-            horizons[may_hit] = self._horizons(corners[may_hit], plane_normals[may_hit])
-        horizon = horizons[face_of_sample]
+        if 0 < is_low.sum() * len(self._mesh.vertices) <= most:
+            sines[is_low] = self._horizons(corners[is_low], plane_normals[is_low])
+        horizon = sines[face_of_sample]
         blocks_light = (surface.normals * surface.planes).sum(1) < 1 - 2 * MAX_IGNORED_LIGHT
         pixels = fragments.sample_to_pixel[(horizon > 0) | blocks_light].unique()
         return pixels, horizon + ROUNDING
@@ -337,7 +342,7 @@ class Rays:
         """Bound the sine of the elevation at which points of G faces see the rest of the mesh.
 
         If another face lies below a plane of slope t that contains an edge of the seen face and
-        rises beyond it, all rays between both have at most the slope t. The edge with the least
+        rises beyond it, all rays between both have at most the slope t. The edge with the smallest
         slope gives the bound. It is 1 if more than `MAX_ABOVE` faces rise above the face.
         """
         origin = torch.from_numpy(self._mesh.origin)
@@ -357,22 +362,23 @@ class Rays:
         # Rays start at the offset above the face.
         coordinate[:, 0] += self.offset
         planes = torch.cat([axes, -coordinate], 2)
-        horizons = []
+        sines = []
         for block in planes.split(8 * BLOCK // len(vertices) + 1):
             above = csr_matrix((block[:, 0] @ vertices.T > 0).numpy())
             has_few = above @ face_count <= MAX_ABOVE
             pairs = (above.multiply(has_few[:, None]) @ faces_of_vertex).nonzero()
             row, other = (torch.from_numpy(index).long() for index in pairs)
-            horizon = torch.from_numpy(~has_few).double()
+            sine = torch.from_numpy(~has_few).double()
             # Of the vertices of the other face: height, and distance beyond each edge.
             coordinates = torch.einsum("evd,eld->lev", vertices[faces[other]], block[row])
             height, beyond = coordinates[0], coordinates[1:]
             slope = height / beyond
-            least = slope.where(beyond > 0, math.inf).where(height > 0, 0.0).amax(2)
-            largest = slope.where((height <= 0) & (beyond < 0), math.inf).amin(2)
-            bound = least.where(least <= largest, math.inf).amin(0).atan().sin()
-            horizons.append(horizon.scatter_reduce(0, row, bound, "amax"))
-        return torch.cat(horizons)
+            # Slopes of the planes through an edge with all three vertices below them.
+            minimum = slope.where(beyond > 0, math.inf).where(height > 0, 0.0).amax(2)
+            maximum = slope.where((height <= 0) & (beyond < 0), math.inf).amin(2)
+            bound = minimum.where(minimum <= maximum, math.inf).amin(0).atan().sin()
+            sines.append(sine.scatter_reduce(0, row, bound, "amax"))
+        return torch.cat(sines)
 
     def first_hit(
         self,

@@ -114,13 +114,15 @@ def test_a_network_gets_images_in_its_own_units(network, images, options, expect
 
 
 def test_parameters_that_the_first_pass_replaces_learn_after_an_attack():
-    """As `torch.distributed.fsdp.fully_shard` replaces them."""
+    """FSDP (`fully_shard`) replaces parameters."""
     network = nn.Linear(2, 2)
     network.bias.requires_grad_(False)
     with gradient_flags_kept(network):
         network.requires_grad_(False)
         network.weight = nn.Parameter(network.weight.detach(), requires_grad=False)
-    assert [parameter.requires_grad for parameter in network.parameters()] == [True, False]
+        network.made = nn.Parameter(torch.ones(1))
+    flags = {name: parameter.requires_grad for name, parameter in network.named_parameters()}
+    assert flags == {"weight": True, "bias": False, "made": True}
 
 
 def test_a_plain_network_is_attacked_like_its_classifier_and_stays_as_it_is(network):

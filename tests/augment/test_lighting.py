@@ -111,6 +111,11 @@ def test_plain_tensors_and_pil_masks_beside_a_named_image_stay(kind, key):
     assert not torch.equal(relit[key], picture(3, 6, 6))
 
 
+def test_a_path_at_the_key_of_an_image_names_no_image():
+    relit = nb.RandomLighting("linear")({"image": "a.png", "photo": Image.new("RGB", (6, 6), 99)})
+    assert relit["image"] == "a.png" and relit["photo"].getextrema() != ((99, 99),) * 3
+
+
 @pytest.mark.parametrize("kind", [list, tuple])
 def test_all_images_of_a_list_change_and_its_boxes_stay(kind):
     images = kind(picture(3, 6, 6 + extra) for extra in range(3))
