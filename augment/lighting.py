@@ -214,7 +214,7 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
         paths, spec = tree_flatten_with_path(sample)
         leaves = [leaf for _, leaf in paths]
         keys = [_key_of(path) for path, _ in paths]
-        # Keys of leaves that are no images: all but `IMAGES`, if the sample has one of those.
+        # Keys of leaves that are no images: all but `IMAGES`, if one of those has an image.
         kinds = Tensor, Image.Image, np.ndarray
         named = [key for key, leaf in zip(keys, leaves, strict=True) if isinstance(leaf, kinds)]
         hidden = {"depth"} if {*IMAGES}.isdisjoint(named) else {*keys} - {*IMAGES}

@@ -5,8 +5,8 @@
 The answer to each question is a few lines of JSON. A line compares one way with
 another, and the two take turns. The command first runs the tests of
 tests/train/test_gpu.py, and then measures. Each question is answered by a
-process of its own. All of them together take at most --minutes. The same command
-then answers the questions that are left. If a question fails, its
+process of its own. All of them together take at most --minutes. Given once more, the
+command answers the questions that are left. If a question fails, its
 line has the error, and the command continues with the next question. Meshes,
 data and networks are the project's own. If there are several GPUs, `training` runs
 on one and on all of them. --device cpu rehearses the questions that need no

@@ -438,10 +438,10 @@ def explain(error: BaseException, keys: Mapping[str, Any], words: Sequence[str])
     wrong = next((cause for cause in causes(error) if getattr(cause, "full_key", None)), error)
     key = str(getattr(wrong, "full_key", None) or "")
     if isinstance(wrong, ConfigKeyError | ConfigAttributeError):
-        # After a typing error, a key of a similar name in another group is the most similar one,
-        # and of several the first with the fewest groups.
-        deepest_first = sorted([*keys][::-1], key=lambda known: -known.count("."))
-        by_name = {known.rpartition(".")[2]: known for known in deepest_first}
+        # The group may be wrong, and the name right or nearly right. Of keys with the same name,
+        # the first one in the fewest groups is meant.
+        by_depth = sorted(keys, key=lambda known: known.count("."))
+        by_name = {known.rpartition(".")[2]: known for known in reversed(by_depth)}
         names = get_close_matches(key.rpartition(".")[2], by_name, 1, 0.8)
         close = get_close_matches(key, keys, 1, 0.9) or [by_name[name] for name in names]
         close = close or get_close_matches(key, keys, 1, 0.75)

@@ -58,8 +58,8 @@ MAX_COMPARISONS = 2**30
 # Largest height of the mesh above a face whose horizon is computed, as a fraction of the largest
 # vertex coordinate.
 MAX_RISE = 0.1
-# Largest number of faces that rise above a face whose horizon is computed. Each counts once for
-# each of its vertices above.
+# The horizon of a face is computed if at most this number of faces rise above it. A face counts
+# once for each of its vertices above.
 MAX_ABOVE = 384
 # The horizons are computed if they need at most this number of comparisons for each ray.
 COMPARISONS_PER_RAY = 4
@@ -341,9 +341,10 @@ class Rays:
     ) -> Float[Tensor, " G"]:
         """Bound the sine of the elevation at which points of G faces see the rest of the mesh.
 
-        If another face lies below a plane of slope t that contains an edge of the seen face and
-        rises beyond it, all rays between both have at most the slope t. The edge with the smallest
-        slope gives the bound. It is 1 if more than `MAX_ABOVE` faces rise above the face.
+        A plane contains an edge of the seen face, and rises beyond it with the slope t. If another
+        face lies below this plane, all rays from the seen face to it have at most the slope t. The
+        edge with the smallest t counts for this pair, and the steepest pair gives the bound. The
+        bound is 1 if more than `MAX_ABOVE` faces rise above the seen face.
         """
         origin = torch.from_numpy(self._mesh.origin)
         corners = corners - origin
@@ -352,8 +353,8 @@ class Rays:
         entries = np.ones(faces.numel(), bool), (faces.ravel(), np.arange(faces.numel()) // 3)
         faces_of_vertex = csr_matrix(entries, (len(vertices), len(faces)))
         face_count = np.diff(faces_of_vertex.indptr)
-        # The plane of each face, and a plane across it through each edge. Their normals point up
-        # and outward. A plane has its normal, and minus the coordinate along it.
+        # Each seen face has four planes: its own, and one at a right angle to it through each edge.
+        # A row has the unit normal, which points up or outward, and minus the coordinate along it.
         outward = torch.linalg.cross(corners.roll(-1, 1) - corners, normals[:, None])
         inside = ((corners.roll(-2, 1) - corners) * outward).sum(2, keepdim=True)
         outward = F.normalize(outward * -inside.sign(), dim=2)
@@ -369,11 +370,11 @@ class Rays:
             pairs = (above.multiply(has_few[:, None]) @ faces_of_vertex).nonzero()
             row, other = (torch.from_numpy(index).long() for index in pairs)
             sine = torch.from_numpy(~has_few).double()
-            # Of the vertices of the other face: height, and distance beyond each edge.
+            # Height of each vertex of the other face, and its distance beyond each edge.
             coordinates = torch.einsum("evd,eld->lev", vertices[faces[other]], block[row])
             height, beyond = coordinates[0], coordinates[1:]
             slope = height / beyond
-            # Slopes of the planes through an edge with all three vertices below them.
+            # A plane through an edge lies above all three vertices if its slope is between these.
             minimum = slope.where(beyond > 0, math.inf).where(height > 0, 0.0).amax(2)
             maximum = slope.where((height <= 0) & (beyond < 0), math.inf).amin(2)
             bound = minimum.where(minimum <= maximum, math.inf).amin(0).atan().sin()
