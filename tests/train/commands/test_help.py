@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from augment.settings import NormalizedLightSettings
 from renderer.settings import facts_of
 from scripts.attack import main as attack
+from scripts.render import main as render
 from train.__main__ import main as train
 from train.cli import USER_ERROR
 from train.run_config import format_command
@@ -25,6 +26,11 @@ ROOT = Path(__file__).parents[3]
 def test_help_shows_each_setting(command):
     shown = {line.strip().partition("=")[0] for line in command.format_help().splitlines()}
     assert {key for key, _ in dotted(OmegaConf.to_container(command.compose()))} <= shown
+
+
+@pytest.mark.parametrize("command", [train, attack, render], ids=["train", "attack", "render"])
+def test_help_without_choices_shows_the_values_that_hydra_composes(command):
+    assert command.format_help() == command.format_help(["seed=0"])
 
 
 def test_help_names_each_field_of_normalize_light():
