@@ -65,13 +65,12 @@ def most_threads() -> int:
     cores that its container may use. More threads than cores would wait for each other.
     """
     has_affinity = hasattr(os, "sched_getaffinity")
-    bound = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
-    permitted = bound
+    cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
     # Without a limit, the file of the container's quota is missing, or contains "max 100000".
     with suppress(OSError, ValueError):
         quota, period = QUOTA.read_text().split()
-        permitted = max(1, int(quota) // int(period))
-    return min(THREADS, bound, permitted)
+        cores = min(cores, max(1, int(quota) // int(period)))
+    return min(THREADS, cores)
 
 
 def choose_threads(network: nn.Module, batch_size: int, size: int) -> int:
