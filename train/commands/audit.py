@@ -212,10 +212,8 @@ def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page
     if settings.meshes:
         settings = complete(settings, networks[CLASSIFIER].classes)
         plan = _Plan(settings, networks, device)
-    # A path below pretrained/ is found from any working folder.
-    photographs = published_folder(Path(str(settings.unlabeled)))
     if settings.unlabeled:
-        find_unlabeled(photographs)
+        find_unlabeled(published_folder(Path(settings.unlabeled)))
     caveats = _caveats(given, networks, plan)
     # config.yaml does not name networks that the caller passes as objects, so the results there may
     # be about others. A folder without config.yaml raises an InputError.
@@ -260,7 +258,7 @@ def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page
                 console.warning(f"first results: {path}")
         if settings.unlabeled:
             try:
-                _attack_photographs(settings, networks, photographs, out)
+                _attack_photographs(settings, networks, out)
             except InputError as error:
                 # The results of the meshes are shown.
                 if plan is None:
@@ -270,10 +268,10 @@ def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page
         return write_page(plan.image_folders if plan else {}, out, caveats)
 
 
-def _attack_photographs(
-    settings: AuditSettings, networks: Networks, photographs: Path, out: Path
-) -> None:
+def _attack_photographs(settings: AuditSettings, networks: Networks, out: Path) -> None:
     """Attack the light of photographs without labels, and write the results for each network."""
+    # A path below pretrained/ is found from any working folder.
+    photographs = published_folder(Path(str(settings.unlabeled)))
     attack = RelightingSettings(passes=relit.PASSES)
     count = settings.scale(relit.PHOTOGRAPH_COUNT)
     options: dict[str, Any] = {"seed": settings.seed, "limit": count}
