@@ -144,19 +144,12 @@ class MixedPrecision(Network):
         return outputs.float() if isinstance(outputs, Tensor) else outputs
 
 
-def place(
-    network: nn.Module, settings: TrainSettings, size: int, threads: int | None
-) -> MixedPrecision:
-    """Move a network to the device that trains it, and set the precision and the CPU threads.
-
-    Without `threads`, `choose_threads` chooses them for images of `size` pixels per side.
-    """
+def place(network: nn.Module, settings: TrainSettings) -> MixedPrecision:
+    """Move a network to the device that trains it, and set the precision."""
     set_deterministic(settings.deterministic)
     device = choose_device(settings.device)
     precision = choose_precision(settings.precision, device, network)
-    model = MixedPrecision(network.to(device).to(memory_format=torch.channels_last), precision)
-    torch.set_num_threads(threads or choose_threads(model, settings.batch_size, size))
-    return model
+    return MixedPrecision(network.to(device).to(memory_format=torch.channels_last), precision)
 
 
 @functools.cache
