@@ -495,7 +495,7 @@ def mean_with_interval(parts: Sequence[ScoredGroup], name: str, other: str | Non
         return average(runs).estimate
     others = [leave_out_units(parts, other, seed) for seed in range(len(parts[0].hits[other]))]
     count = max(len(runs), len(others))
-    return change(runs * (count // len(runs)), others * (count // len(others)))
+    return change(runs * (count // len(runs)), others * (count // len(others)), is_paired=True)
 
 
 def leave_out_units(parts: Sequence[ScoredGroup], name: str, seed: int) -> Jackknife:

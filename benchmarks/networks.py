@@ -155,7 +155,7 @@ def score_renders(network: Classifier, renders: Path) -> Scores:
         shutil.copytree(renders / NATURAL / OTHERS, folders[ADVERSARIAL] / OTHERS)
         write_images(folders[ADVERSARIAL], {LABEL: attacked})
         for title, folder in folders.items():
-            found = score(predictor.predict(folder, LABEL)).overall
+            found = score(predictor.predict(folder, LABEL, False)).overall
             values = (found.auc, found.recall_at["0.05"], found.recall, found.false_positive_rate)
             scores[title] = dict(zip(QUANTITIES, values, strict=True))
     return scores

@@ -135,7 +135,7 @@ def read_renders(folder: Path, size: int) -> tuple[list[Photograph], Tensor]:
         The renders with their labels, and their images, uint8 (N, 3, size, size).
     """
     found = find_photographs(folder, [LABEL], LABEL)
-    photographs, images, _ = load_photographs(folder, found, size)
+    photographs, images, _ = load_photographs(folder, found, size, False)
     return photographs, images
 
 

@@ -117,7 +117,7 @@ def load(folder: Path, size: int, every: int) -> tuple[Tensor, Tensor]:
     for photograph in find_unlabeled(folder):
         if class_of(photograph.path.name) % every == 0:
             chosen.append(photograph)
-    found, images, _ = load_photographs(folder, chosen, size)
+    found, images, _ = load_photographs(folder, chosen, size, False)
     return images, torch.tensor([class_of(item.path.name) for item in found])
 
 

@@ -551,7 +551,7 @@ def predict(model: MixedPrecision, folder: Path) -> Predictions:
     """
     network = model.network
     predictor = Predictor(model, network.classes, network.size)
-    return predictor.predict(folder, LABEL).predictions
+    return predictor.predict(folder, LABEL, False).predictions
 
 
 def pool(run: str, network: Classifier, predictions: Predictions) -> Evaluation:

@@ -26,7 +26,7 @@ from augment.classifier import Classifier, OperatingPoint, TaskNetwork
 from augment.exposure import DIM, with_normalized_light
 from augment.files import NetworkFacts, is_network_file, require_no_facts
 from augment.network import FROM_FILE, Inputs, say_inputs, say_once
-from augment.settings import PYTHON, NormalizeLight, split_function
+from augment.settings import PYTHON, split_function
 from augment.sources import SOURCES, import_function, load_classifier
 from augment.switch import LIT_NAME, SWITCHES, Recognizer
 from augment.tasks.detection import Detection
@@ -111,12 +111,7 @@ def load_newest(folder: Path) -> tuple[dict[str, Any], str | None]:
 
 
 def load_network(
-    name: str,
-    weights: str | Path | None = None,
-    *,
-    normalize_light: NormalizeLight = None,
-    trust_code: bool = False,
-    **facts: Any,
+    name: str, weights: str | Path | None = None, *, trust_code: bool = False, **facts: Any
 ) -> Any:
     """Load a classifier by its name: the network of a training run, or any other classifier.
 
@@ -133,23 +128,21 @@ def load_network(
         second = load_network(other, trust_code=trust_code, **options)
         if name.startswith(LIT_NAME):
             say_once(f"{other} gets the images whose light it recognizes as that of its training")
-            return network.with_lit(second).normalizing_light(normalize_light)
+            return network.with_lit(second)
         say_once(f"{other} gets the images whose 98th percentile of linear values is below {DIM}")
-        return network.with_dim(second).normalizing_light(normalize_light)
+        return network.with_dim(second)
     path = Path(name)
     # weights.pt alone is no network. It lies in the folder of its run.
     folder = path.parent if path.name == WEIGHTS else path
     if name and ((folder / BEST).is_file() or (published_folder(folder) / PUBLISHED).is_file()):
         name = f"{RUN}{folder}"
     if not name.startswith(RUN):
-        options = {"normalize_light": normalize_light, "trust_code": trust_code}
-        return load_classifier(name, weights, **options, **facts)
+        return load_classifier(name, weights, trust_code=trust_code, **facts)
     require_no_facts(name, NetworkFacts(**facts))
     # Error messages about the argument `run` begin with `name` instead, the argument of
     # this function.
     with keyed(run="name"):
-        classifier = load_run(name.removeprefix(RUN), weights, trust_code=trust_code)
-    return classifier.normalizing_light(normalize_light)
+        return load_run(name.removeprefix(RUN), weights, trust_code=trust_code)
 
 
 def split_switch(name: str) -> tuple[str, str]:
@@ -168,7 +161,7 @@ def split_switch(name: str) -> tuple[str, str]:
 
 def load_chosen(settings: TaskSettings) -> Any:
     """Load the network that the settings of a command choose, with its task."""
-    names = ("weights", "classes", "size", "normalization", "normalize_light", "prompt")
+    names = ("weights", "classes", "size", "normalization", "prompt")
     given = {name: getattr(settings, name) for name in names}
     task = None
     if settings.decode is not None:
@@ -180,6 +173,7 @@ def load_chosen(settings: TaskSettings) -> Any:
     # Error messages about the arguments `name` and `task` begin with these settings instead.
     with keyed(name="network", task="decode"):
         network = load_network(str(settings.network), trust_code=settings.trust, task=task, **given)
+        network = network.normalizing_light(settings.normalize_light)
     return with_task(network, settings)
 
 

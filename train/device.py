@@ -65,13 +65,12 @@ def most_threads() -> int:
     cores that its container may use. More threads than cores would wait for each other.
     """
     has_affinity = hasattr(os, "sched_getaffinity")
-    bound = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
-    permitted = bound
+    cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
     # Without a limit, the file of the container's quota is missing, or contains "max 100000".
     with suppress(OSError, ValueError):
         quota, period = QUOTA.read_text().split()
-        permitted = max(1, int(quota) // int(period))
-    return min(THREADS, bound, permitted)
+        cores = min(cores, max(1, int(quota) // int(period)))
+    return min(THREADS, cores)
 
 
 def choose_threads(network: nn.Module, batch_size: int, size: int) -> int:
@@ -145,19 +144,12 @@ class MixedPrecision(Network):
         return outputs.float() if isinstance(outputs, Tensor) else outputs
 
 
-def place(
-    network: nn.Module, settings: TrainSettings, size: int, threads: int | None
-) -> MixedPrecision:
-    """Move a network to the device that trains it, and set the precision and the CPU threads.
-
-    Without `threads`, `choose_threads` chooses them for images of `size` pixels per side.
-    """
+def place(network: nn.Module, settings: TrainSettings) -> MixedPrecision:
+    """Move a network to the device that trains it, and set the precision."""
     set_deterministic(settings.deterministic)
     device = choose_device(settings.device)
     precision = choose_precision(settings.precision, device, network)
-    model = MixedPrecision(network.to(device).to(memory_format=torch.channels_last), precision)
-    torch.set_num_threads(threads or choose_threads(model, settings.batch_size, size))
-    return model
+    return MixedPrecision(network.to(device).to(memory_format=torch.channels_last), precision)
 
 
 @functools.cache

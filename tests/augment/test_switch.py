@@ -76,14 +76,16 @@ def test_a_name_of_two_networks_is_the_first_with_the_second_for_dim_images():
 
 
 def test_only_the_second_network_of_a_switch_gets_images_in_normalized_light():
-    from train.checkpoints import load_network
+    from train.checkpoints import load_chosen, load_network
+    from train.settings import TaskSettings
 
     name = "dim:run:pretrained/none+run:pretrained/best"
     plain, dim = nb.load("none"), nb.load("best").normalizing_light()
     images = torch.rand(2, 3, 32, 32, generator=torch.Generator().manual_seed(0))
     expected = torch.cat([plain(images), dim(images * 0.1)])
     settings = nb.NormalizedLightSettings()
-    for network in (load_network(name).normalizing_light(), load_network(name, normalize_light={})):
+    chosen = load_chosen(TaskSettings(network=name, normalize_light={}))
+    for network in (load_network(name).normalizing_light(), chosen):
         assert network.normalized_light == settings
         torch.testing.assert_close(network(torch.cat([images, images * 0.1])), expected)
         with pytest.raises(nb.InputError, match="already"):

@@ -418,8 +418,7 @@ def recommend(evaluations: Evaluations) -> Recommendation | None:
     chosen = original
     for name in remedies:
         # Of a network over itself, there is no gain.
-        gains_of_name = (gains[name], gain_over(name, chosen))
-        if all(gain and gain.low is not None and gain.low > 0 for gain in gains_of_name):
+        if all(gain and gain.low > 0 for gain in (gains[name], gain_over(name, chosen))):
             chosen = name
     title = TITLES[metric]
     gain = gains.get(chosen)

@@ -174,24 +174,19 @@ class RelitScores(ShortRepr):
 
 
 def attack_folder(
-    classifier: TaskNetwork,
-    folder: Path,
-    settings: RelightingSettings,
-    out: Path,
-    *,
-    limit: int | None = None,
-    **options: Any,
+    classifier: TaskNetwork, folder: Path, settings: RelightingSettings, out: Path, **options: Any
 ) -> RelitScores:
     """Attack a network by the light of a projector on photographs, and write the results.
 
-    `limit` photographs at equal distances in the list are attacked, and as many objects in them, or
-    all if it is None. `options` are those of `attack_photographs`.
+    `options` are those of `attack_photographs`. With a `limit`, as many photographs at equal
+    distances in the list are attacked, and as many objects in them.
     """
     found = find_unlabeled(folder)
+    chosen = evenly_spaced(found, options.get("limit", len(found)))
     readable, images, unreadable = load_photographs(
-        folder, evenly_spaced(found, limit or len(found)), classifier.size, skip_unreadable=True
+        folder, chosen, classifier.size, skip_unreadable=True
     )
-    result = relighting.attack_photographs(classifier, images, settings, limit=limit, **options)
+    result = relighting.attack_photographs(classifier, images, settings, **options)
     out.mkdir(parents=True, exist_ok=True)
     classes = [*result.classifier.classes, NOTHING]
     photographs = []

@@ -44,11 +44,11 @@ from train.data.photo import DESCRIPTION
 from train.data.photographs import find_photographs, find_unlabeled
 from train.device import choose_device
 from train.laboratory.laboratory import write_laboratory
-from train.results.overwrite import require_replaceable
+from train.results.overwrite import output_folder
 from train.results.page import PAGE
 from train.results.scoring import Predictor, evaluate_photographs
 from train.run_config import CONFIG, read_config, require_same, require_same_weights, write_config
-from train.run_folder import read_json, sole_writer, writable_folder
+from train.run_folder import read_json, sole_writer
 from train.settings import LABORATORY, OTHER_PREFIX, PHOTOGRAPHS, published_folder, read_objects
 from train.system import command_line
 
@@ -212,18 +212,15 @@ def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page
     if settings.meshes:
         settings = complete(settings, networks[CLASSIFIER].classes)
         plan = _Plan(settings, networks, device)
-    # A path below pretrained/ is found from any working folder.
-    photographs = published_folder(Path(str(settings.unlabeled)))
     if settings.unlabeled:
-        find_unlabeled(photographs)
+        find_unlabeled(published_folder(Path(settings.unlabeled)))
     caveats = _caveats(given, networks, plan)
-    out = writable_folder(settings.out, "out")
     # config.yaml does not name networks that the caller passes as objects, so the results there may
     # be about others. A folder without config.yaml raises an InputError.
     is_continued = False
     with suppress(InputError):
-        is_continued = is_named and "hard_negatives" in read_config(out / CONFIG)
-    require_replaceable(out, "out", settings.overwrite or is_continued)
+        is_continued = is_named and "hard_negatives" in read_config(Path(settings.out) / CONFIG)
+    out = output_folder(settings.out, settings.overwrite or is_continued)
     renders = out / "renders"
     # Renders of an earlier, stopped audit are used again, and need no Mitsuba.
     has_renders = renders.exists() and not settings.overwrite
@@ -254,14 +251,14 @@ def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page
         # Without meshes, the page is about photographs, and has no label.
         label = settings.label if plan else ""
         write_page = partial(page.write_audit_page, label, names, audited.name_remedies(networks))
-        for missing, folders in plan.measure(networks, out, settings) if plan else ():
+        for missing, folders in plan.measure(networks, out) if plan else ():
             path = write_page(folders, out, caveats, missing).path
             # A caller from Python gets the complete page.
             if is_named:
                 console.warning(f"first results: {path}")
         if settings.unlabeled:
             try:
-                _attack_photographs(settings, networks, photographs, out)
+                _attack_photographs(settings, networks, out)
             except InputError as error:
                 # The results of the meshes are shown.
                 if plan is None:
@@ -271,10 +268,10 @@ def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page
         return write_page(plan.image_folders if plan else {}, out, caveats)
 
 
-def _attack_photographs(
-    settings: AuditSettings, networks: Networks, photographs: Path, out: Path
-) -> None:
+def _attack_photographs(settings: AuditSettings, networks: Networks, out: Path) -> None:
     """Attack the light of photographs without labels, and write the results for each network."""
+    # A path below pretrained/ is found from any working folder.
+    photographs = published_folder(Path(str(settings.unlabeled)))
     attack = RelightingSettings(passes=relit.PASSES)
     count = settings.scale(relit.PHOTOGRAPH_COUNT)
     options: dict[str, Any] = {"seed": settings.seed, "limit": count}
@@ -312,7 +309,7 @@ class _Plan:
     """Images and lighting of an audit, checked before anything is written.
 
     Attributes:
-        label: Class whose objects are tested.
+        settings: Settings of the audit, whose label is the class whose objects are tested.
         items: Meshes and hard negatives, which need not be of a class of the networks.
         image_folders: Folders of labeled test images: "laboratory" for
             path-traced renders, and "photographs". Each may be missing.
@@ -323,16 +320,16 @@ class _Plan:
     """
 
     def __init__(self, settings: AuditSettings, networks: Networks, device: torch.device):
-        self.label = settings.label
-        meshes = [*read_objects(settings.meshes, self.label, "meshes").values()]
+        self.settings = settings
+        meshes = [*read_objects(settings.meshes, settings.label, "meshes").values()]
         hard_negatives = [*read_objects(settings.hard_negatives, "", "hard_negatives").values()]
         for item in hard_negatives:
             # Such a label is of no class of the network, and names a folder of test images.
             if item.label == "":
                 item.label = OTHER_PREFIX + class_names.name_of_mesh(item.mesh)
         for item in meshes:
-            if item.label != self.label:
-                fault = f"meshes has {item.mesh} of the class {item.label}, not {self.label}"
+            if item.label != settings.label:
+                fault = f"meshes has {item.mesh} of the class {item.label}, not {settings.label}"
                 raise InputError(f"{fault}: give others as hard_negatives", "meshes")
         self.items = [*meshes, *hard_negatives]
         folders = {LABORATORY: settings.laboratory, PHOTOGRAPHS: settings.photos}
@@ -362,9 +359,9 @@ class _Plan:
                 network.label(name)
             for name, folder in self.image_folders.items():
                 with keyed("photos" if name == PHOTOGRAPHS else "laboratory"):
-                    found = find_photographs(folder, network.classes, self.label)
+                    found = find_photographs(folder, network.classes, settings.label)
                 if name == PHOTOGRAPHS:
-                    self.has_other_photographs = bool({item.label for item in found} - {self.label})
+                    self.has_other_photographs = any(item.label != settings.label for item in found)
         # Hard negatives and lights are loaded only to report a file that cannot be read
         # before the audit begins.
         positives = [load_object(item) for item in meshes]
@@ -389,9 +386,7 @@ class _Plan:
         """Return the folders of test images on which `measure` has scored the networks by now."""
         return {name: folder for name, folder in self.image_folders.items() if folder.exists()}
 
-    def measure(
-        self, networks: Networks, out: Path, settings: AuditSettings
-    ) -> Iterator[tuple[str, dict[str, Path]]]:
+    def measure(self, networks: Networks, out: Path) -> Iterator[tuple[str, dict[str, Path]]]:
         """Test and attack the networks, except for results that exist already.
 
         What takes long comes last. Before it, yield what is still to come, in words, and the
@@ -437,7 +432,7 @@ class _Plan:
         if later:
             yield later[0], self.measured_folders()
             renders = self.image_folders[LABORATORY]
-            _write_folder(renders, partial(_write_renders, settings, self, largest_size(networks)))
+            _write_folder(renders, partial(_write_renders, self, largest_size(networks)))
             self._score(networks, out)
 
     def _score(self, networks: Networks, out: Path) -> None:
@@ -446,7 +441,7 @@ class _Plan:
             for name, images in self.measured_folders().items():
                 predictor = Predictor(network, network.classes, network.size, self.views.device)
                 # Unreadable photographs are left out.
-                evaluate = partial(evaluate_photographs, predictor, images, self.label)
+                evaluate = partial(evaluate_photographs, predictor, images, self.settings.label)
                 _write_folder(out / key / name, partial(evaluate, skip_unreadable=True))
             if self.annotations is not None:
                 write_scores = partial(lights.score_photographs, network, self.annotations)
@@ -504,12 +499,13 @@ def _prepare_folder(settings: AuditSettings, out: Path, renders: Path, networks:
     write_config(out, settings, command=command_line("audit"), hashes=hashes)
 
 
-def _write_renders(settings: AuditSettings, plan: _Plan, size: Size, out: Path) -> None:
+def _write_renders(plan: _Plan, size: Size, out: Path) -> None:
     """Render the path-traced test images on which an audit scores networks.
 
     They show the meshes and the hard negatives under each pattern of PATTERNS,
     and in each environment map of the audit.
     """
+    settings = plan.settings
     lab_settings = LabSettings(
         out=str(out),
         label=settings.label,

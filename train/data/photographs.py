@@ -253,10 +253,7 @@ def _read_table(table: Path) -> dict[PurePosixPath, Row]:
 
 
 def load_photographs(
-    folder: Path,
-    photographs: Sequence[Photograph],
-    size: Size = 32,
-    skip_unreadable: bool | None = False,
+    folder: Path, photographs: Sequence[Photograph], size: Size, skip_unreadable: bool | None
 ) -> tuple[list[Photograph], Tensor, list[str]]:
     """Read photographs at the size of the input of a network.
 

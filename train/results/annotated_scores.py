@@ -293,15 +293,14 @@ def evaluate_segmenter(network: TaskNetwork, folder: Path, how: Showing) -> Segm
     """Segment photographs, and compare the classes of the pixels with those of masks."""
     photographs, masks, missing = annotated.read_masks(folder)
     pictures: dict[str, Tensor] = {}
-    count = 0
-    # Values of all masks.
+    # Names of the photographs that can be read, and values of their masks.
+    names: list[str] = []
     seen: set[int] = set()
 
     # Pairs are read one after the other, so that not all masks are in memory.
     def pairs() -> Iterator[tuple[ClassMap, ClassMap]]:
-        nonlocal count
         for item, fitted, output in _outputs(network, photographs, how, pictures):
-            count += 1
+            names.append(item.name)
             mask = annotated.fit_mask(masks[item.name], fitted, len(network.classes), seen)
             yield output.argmax(0).cpu().numpy(), mask
 
@@ -314,7 +313,7 @@ def evaluate_segmenter(network: TaskNetwork, folder: Path, how: Showing) -> Segm
     return SegmentationScores(
         size=height_and_width(network.size),
         fit=how.fit,
-        photograph_count=count,
+        photograph_count=len(names),
         missing=missing,
         contents=f" ({len(missing)} others have no mask)" if missing else "",
         pictures=pictures,

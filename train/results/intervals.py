@@ -205,9 +205,7 @@ def average(runs: Sequence[Jackknife]) -> Jackknife:
     return Jackknife(values.mean(axis=0), without, runs[0].unit_count, over, at_ends)
 
 
-def change(
-    after: Sequence[Jackknife], before: Sequence[Jackknife], is_paired: bool = True
-) -> Estimate:
+def change(after: Sequence[Jackknife], before: Sequence[Jackknife], is_paired: bool) -> Estimate:
     """Subtract the means of a metric over two groups of runs, with the 95% interval.
 
     The interval combines those of both means and their correlation (Zou and

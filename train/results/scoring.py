@@ -97,9 +97,7 @@ class Predictor:
     size: Size = 32
     device: str | torch.device = "cpu"
 
-    def predict(
-        self, folder: Path, label: Label, skip_unreadable: bool = False
-    ) -> FolderPredictions:
+    def predict(self, folder: Path, label: Label, skip_unreadable: bool) -> FolderPredictions:
         """Predict the classes of all photographs of a folder."""
         labels = label_names(label)
         found = folders.find_photographs(folder, self.classes, label)

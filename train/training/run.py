@@ -22,7 +22,7 @@ from renderer.io.files import remove
 from train import checkpoints, console
 from train.data import photographs
 from train.data.sets import DataSet, Split, channel_statistics, held_out_rows
-from train.device import MixedPrecision, place
+from train.device import MixedPrecision, choose_threads, place
 from train.laboratory.laboratory import is_laboratory, kept_aside_settings, write_laboratory
 from train.networks import CLASSIFIER, build_network, describe
 from train.results.metrics import METRICS
@@ -163,7 +163,8 @@ class Run:
         if recipe.freeze:
             with keyed(stage="train.freeze"):
                 freeze(wrappers.unwrapped(network), recipe.freeze, data.size)
-        model = place(wrapped, recipe, data.size, threads)
+        model = place(wrapped, recipe)
+        torch.set_num_threads(threads or choose_threads(model, recipe.batch_size, data.size))
         device = wrappers.device_of(model)
         # By default, pretrained classifiers keep the statistics of their normalizations.
         if recipe.eval_mode is None:

@@ -399,6 +399,6 @@ def test_each_lighting_of_the_laboratory_has_the_same_number_of_setups(monkeypat
     settings = AuditSettings(
         network="any", label="orange", meshes=["solid:orange"], environments=environments
     )
-    plan = SimpleNamespace(items=[ObjectSettings("solid:orange:1", label="orange")])
-    audit._write_renders(settings, plan, 8, tmp_path)
+    items = [ObjectSettings("solid:orange:1", label="orange")]
+    audit._write_renders(SimpleNamespace(settings=settings, items=items), 8, tmp_path)
     assert made[0].setups == 6 * (len(made[0].patterns) + 3)

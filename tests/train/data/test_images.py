@@ -43,7 +43,7 @@ def files(tmp_path) -> ImageFiles:
 
 
 def test_center_squares_are_those_of_images_in_memory_whatever_their_mode(files):
-    _, expected, _ = load_photographs(files.folder, find_unlabeled(files.folder), SIZE)
+    _, expected, _ = load_photographs(files.folder, find_unlabeled(files.folder), SIZE, False)
     squares = torch.cat(list(files.squares(torch.arange(len(files)).split(3))))
     assert squares.shape == files.shape
     torch.testing.assert_close(squares[:-1], expected[:-1], rtol=0, atol=0)

@@ -30,9 +30,8 @@ def touch(folder: Path, *names: str) -> Path:
 
 
 def load_one(path: Path) -> np.ndarray:
-    _, images, _ = photographs.load_photographs(
-        path.parent, [photographs.Photograph(PurePosixPath(path.name), "orange", None)]
-    )
+    found = [photographs.Photograph(PurePosixPath(path.name), "orange", None)]
+    _, images, _ = photographs.load_photographs(path.parent, found, 32, False)
     return images[0].permute(1, 2, 0).numpy().astype(int)
 
 
@@ -240,13 +239,13 @@ def test_unreadable_images_are_named_or_skipped(tmp_path):
     found = photographs.find_photographs(tmp_path, CLASSES, "orange")
     for skip_unreadable in (False, True):  # nothing is left when all of them are skipped
         with pytest.raises(InputError, match=r"3 of 3 .*cut\.jpg .*replace them$"):
-            photographs.load_photographs(tmp_path, found, skip_unreadable=skip_unreadable)
+            photographs.load_photographs(tmp_path, found, 32, skip_unreadable)
 
     save_plain(tmp_path / "good.png", (255, 128, 0), (32, 32))
     found = photographs.find_photographs(tmp_path, CLASSES, "orange")
     with pytest.raises(InputError, match=r"3 of 4 .*cut\.jpg .* set skip_unreadable=True"):
-        photographs.load_photographs(tmp_path, found)
-    loaded, images, unreadable = photographs.load_photographs(tmp_path, found, skip_unreadable=True)
+        photographs.load_photographs(tmp_path, found, 32, False)
+    loaded, images, unreadable = photographs.load_photographs(tmp_path, found, 32, True)
     assert [str(photograph.path) for photograph in loaded] == ["good.png"]
     assert (images.permute(0, 2, 3, 1) == torch.tensor([255, 128, 0])).all()
     assert unreadable == broken

@@ -70,7 +70,7 @@ def test_a_laboratory_is_a_folder_of_photographs_with_the_pattern_as_the_source(
         assert counts.pop(("other_lemon", pattern)) == 1
         assert counts.pop(("pear", pattern)) == 1
     assert not counts
-    _, images, _ = load_photographs(laboratory, photographs, 8)
+    _, images, _ = load_photographs(laboratory, photographs, 8, False)
     assert len(images.unique(dim=0)) == 8
 
 

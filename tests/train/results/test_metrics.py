@@ -90,7 +90,7 @@ SCORE_OF_SEED = np.array([0.48, 0.49, 0.51, 0.52])
 
 
 def test_pairing_cancels_what_both_groups_of_runs_share():
-    gain = intervals.change(runs_of(SCORE_OF_SEED + 0.02), runs_of(SCORE_OF_SEED))
+    gain = intervals.change(runs_of(SCORE_OF_SEED + 0.02), runs_of(SCORE_OF_SEED), is_paired=True)
     assert gain.value == pytest.approx(0.02)
     assert gain.high - gain.low < 0.002
 
@@ -110,7 +110,8 @@ def test_two_runs_of_other_seeds_are_still_paired_by_their_images():
     after = intervals.leave_out_of_roc(positives + 0.1 * draws.normal(size=40), negatives, units)
     before = intervals.leave_out_of_roc(positives, negatives, units)
     for one, other in zip(after, before, strict=True):
-        assert intervals.change([one], [other], is_paired=False) == intervals.change([one], [other])
+        gains = [intervals.change([one], [other], is_paired) for is_paired in (False, True)]
+        assert gains[0] == gains[1]
 
 
 def test_intervals_of_few_objects_cover_the_truth():
@@ -160,7 +161,7 @@ def test_a_recall_has_no_lower_limit_if_too_few_negatives_set_the_threshold():
 
 def test_equal_networks_have_equal_recalls():
     recall = roc_of(*np.random.default_rng(0).normal(size=(2, 40)))[1]
-    gain = intervals.change([recall], [recall])
+    gain = intervals.change([recall], [recall], is_paired=True)
     wilson = binomtest(0, 40).proportion_ci(method="wilson")
     assert (gain.low, gain.high) == pytest.approx((-wilson.high, wilson.high))
 
