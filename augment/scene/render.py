@@ -42,7 +42,7 @@ from renderer.shaded_view import PixelRadiance, ShadedView
 from renderer.surface.albedo import paint_faces, surface_albedo
 from renderer.surface.gloss import Gloss
 from renderer.visibility import Rasterizer
-from renderer.visibility.fragments import Fragments, build_fragments, views_at_once
+from renderer.visibility.fragments import Fragments, build_fragments
 
 
 class Layer(NamedTuple):
@@ -436,17 +436,10 @@ class DirectRenderer:
         fragments, _ = self._rasterized(group, self.settings)
         return mesh, fragments, tuple(camera.fixed() for camera in group.cameras)
 
-    def views_at_once(self) -> int:
-        """Return how many views `radiance` renders at once. Rays and silhouettes need one."""
-        if self.settings.silhouettes:
-            return 1
-        casts_rays = self.settings.global_illumination or bool(self.basis.local_lights)
-        return views_at_once(self.settings, self.like.device, casts_rays)
-
     def radiance(
         self, example: int, group: Group, background: Float[Tensor, "_ pixels"], is_draft: bool
     ) -> PixelRadiance:
-        """Render `views_at_once` views of an object with changed shape, colors, gloss or lamps.
+        """Render the views of a group, of an object with changed shape, colors, gloss or lamps.
 
         Their images are one tall image. All views have the same light or, if the object is matte,
         each may have its own. The result is differentiable in the light and in all changes. With
