@@ -232,9 +232,8 @@ def figure(result: AttackResult, example: int) -> Image.Image:
         # A difference of 0 becomes the gray value 1/2.
         "difference": tiles_of((1 + scale * differences) / 2, captions, SIDE),
     }
-    first, last = (
-        result.light(values, example) for values in (result.problem.start, result.minimum.values)
-    )
+    first = result.light(result.problem.start, example)
+    last = result.light(result.minimum.values, example)
     if not torch.equal(first[0], last[0]) or first[1] != last[1]:
         cameras = result.problem.scene.cameras[example]
         for title, (light, basis) in {"initial light": first, "adversarial light": last}.items():
