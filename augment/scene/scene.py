@@ -444,12 +444,11 @@ class Scene:
         """
         indices = errors.as_integers("examples", examples)
         errors.require_shape("examples", indices, "count" if count is None else count)
-        if indices.device.type != "cpu" or not len(indices):
-            return indices.to(self.lights.device)
-        low, high = (int(end) for end in indices.aminmax())
-        if low < 0 or high >= len(self):
-            advice = f"give indices from 0 to {len(self) - 1}"
-            raise errors.InputError(f"examples has indices from {low} to {high}: {advice}")
+        if indices.device.type == "cpu" and len(indices):
+            low, high = (int(end) for end in indices.aminmax())
+            if low < 0 or high >= len(self):
+                advice = f"give indices from 0 to {len(self) - 1}"
+                raise errors.InputError(f"examples has indices from {low} to {high}: {advice}")
         return indices.to(self.lights.device)
 
     @property
