@@ -374,13 +374,13 @@ class DirectRenderer:
         Return also the fraction of each object that nothing hides. It is 0 outside of the view.
         """
         item = self.objects[group.object]
-        mesh, seen, cameras = self._seen(group)
+        mesh, seen = self._seen(group)
         # `item.ends` has the index after the last face of each object.
         # Index of the object that each sample shows. The table comes after the objects.
         ends = torch.tensor(item.ends, device=seen.faces.device)
         owner = torch.searchsorted(ends, seen.faces, right=True)[seen.sample_to_seen_face]
         # Count the samples of each pair of an object and a pixel, shape (O, N, height, width).
-        shape = len(ends) + 1, len(cameras), *self.settings.shape
+        shape = len(ends) + 1, len(seen.cameras), *self.settings.shape
         keys = owner * math.prod(shape[1:]) + seen.pixels[seen.sample_to_pixel]
         counts = torch.bincount(keys, minlength=math.prod(shape)).view(shape)[:-1]
         visible_counts = counts.sum((2, 3))
@@ -388,7 +388,7 @@ class DirectRenderer:
         if item.own is not None:
             # Rasterize each object by itself, to count its samples if nothing hides it.
             parts = np.split(mesh.faces, item.ends)[:-1]
-            shown = cameras, self.settings, self.rasterizer
+            shown = seen.cameras, self.settings, self.rasterizer
             alone = [build_fragments(mesh.vertices, faces, *shown) for faces in parts]
             counts_alone = torch.tensor([[len(each.sample_numbers) for each in of] for of in alone])
         visible = visible_counts / counts_alone.to(ends.device).clamp(min=1)
@@ -403,10 +403,10 @@ class DirectRenderer:
         The depth is the distance from the camera along the viewing direction in world units, and
         normals are along the axes right, up and back of the camera. Both are 0 in other pixels.
         """
-        mesh, seen, cameras = self._seen(group)
+        mesh, seen = self._seen(group)
         fragments = seen.to("cpu")
         # Columns of a pose are the axes right, up and back of the camera, and its position.
-        poses = torch.from_numpy(np.stack([camera.pose()[:3] for camera in cameras]))
+        poses = torch.from_numpy(np.stack([camera.pose()[:3] for camera in seen.cameras]))
         pose = poses[fragments.view_of_face]
         from_camera = pose[:, None, :, 3] - torch.from_numpy(mesh.vertices)[fragments.corners]
         depths = fragments.interpolate(from_camera @ pose[:, :, 2:3])[:, 0]
@@ -425,16 +425,15 @@ class DirectRenderer:
         normals = normalize(normals, dim=1) * fragments.facing[seen_face]
         # Depth and the three components of the normal, shape (4, P).
         at_pixels = torch.cat([depth[None], normals.T])
-        maps = torch.zeros(4, len(cameras) * self.settings.pixel_count, dtype=torch.float32)
+        maps = torch.zeros(4, len(seen.cameras) * self.settings.pixel_count, dtype=torch.float32)
         is_covered = fragments.coverage >= COVERED
         maps[:, fragments.pixels[is_covered]] = at_pixels[:, is_covered].float()
         return maps.view(4, -1, *self.settings.shape).transpose(0, 1)
 
-    def _seen(self, group: Group) -> tuple[Mesh, Fragments, tuple[Camera, ...]]:
-        """Return the mesh of a group, what its cameras see, and the cameras as numbers."""
+    def _seen(self, group: Group) -> tuple[Mesh, Fragments]:
+        """Return the mesh of a group, and what its cameras see."""
         mesh = _moved(self.objects[group.object].mesh, group.changed.vertices)
-        fragments, _ = self._rasterized(group, self.settings)
-        return mesh, fragments, tuple(camera.fixed() for camera in group.cameras)
+        return mesh, self._rasterized(group, self.settings)[0]
 
     def radiance(
         self, example: int, group: Group, background: Float[Tensor, "_ pixels"], is_draft: bool
