@@ -253,10 +253,9 @@ class FrozenTransport:
 
         With a light, only the radiance in this light is kept.
         """
+        assert self._transport is not None  # Only views in environment light are added.
         # None says that shadows and bounces add nothing to the view.
         self.views[key] = None
-        if not self._transport:
-            return
         surface = Surface(self.mesh, fragments.to("cpu"), self._settings)
         if light is not None:
             light = light.cpu().double()
