@@ -256,10 +256,9 @@ class Camera(ABC):
         """
         return self._project_views([self], points)[0]
 
-    @staticmethod
     @abstractmethod
-    def _project_views(cameras: Sequence[Any], points: Points) -> Points:
-        """Project points by N cameras of this class at once, shape (N, V, 3)."""
+    def _project_views(self, cameras: Sequence[Any], points: Points) -> Points:
+        """Project by N cameras of this class, of which this is the first, shape (N, V, 3)."""
 
     def homogeneous(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Project points to homogeneous image coordinates.
@@ -341,8 +340,7 @@ class OrthographicCamera(Camera):
         """Distance that files of cameras store. Images do not depend on it."""
         return 2 * self.clip_range
 
-    @staticmethod
-    def _project_views(cameras: Sequence[Any], points: Points) -> Points:
+    def _project_views(self, cameras: Sequence[Any], points: Points) -> Points:
         """Project points without perspective, with depths from -1 at `near` to 1 at `far`."""
         scales = [[2 / each.width, 2 / each.width, -1 / each.clip_range] for each in cameras]
         scale = np.array(scales)[..., None]
@@ -377,10 +375,9 @@ class PerspectiveCamera(Camera):
         """Field of view, the angle between the left and the right side of the image."""
         return math.degrees(2 * math.atan(self.width / 2 / self.distance))
 
-    @staticmethod
-    def _project_views(cameras: Sequence[Any], points: Points) -> Points:
+    def _project_views(self, cameras: Sequence[Any], points: Points) -> Points:
         """Project points with perspective, with depths from -1 (near plane) to 1 (far plane)."""
-        depths = PerspectiveCamera._depths_of_views(cameras, points)
+        depths = self._depths_of_views(cameras, points)
         field = partial(_column, cameras, points)
         axes = _like(np.stack([each.axes() for each in cameras]), points)
         right, up, back = (axes @ _from_pivots(cameras, points).swapaxes(1, 2)).swapaxes(0, 1)
@@ -388,7 +385,7 @@ class PerspectiveCamera(Camera):
         scale = 2 / field("width") * (distance / depths)
         x = (right + field("right")) * scale + field("principal_right")
         y = (up + field("up")) * scale * field("pixel_aspect") + field("principal_up")
-        _, near, far = cameras[0]._limits(cameras, depths)
+        _, near, far = self._limits(cameras, depths)
         # The near plane is measured along the axis from the pivot to the camera.
         normalized_depth = 2 * far / (far - near) * ((distance - near - back) / depths) - 1
         return _stack([x, y, normalized_depth], 1).swapaxes(1, 2)
@@ -397,13 +394,12 @@ class PerspectiveCamera(Camera):
         """Compute the depths of points, which must lie in front of the camera."""
         return self._depths_of_views([self], points)[0]
 
-    @staticmethod
-    def _depths_of_views(cameras: Sequence[Any], points: Points) -> Points:
+    def _depths_of_views(self, cameras: Sequence[Any], points: Points) -> Points:
         """Compute the depths (N, V) of points that must lie in front of N cameras."""
         backs = _like(np.stack([each.axes()[2] for each in cameras]), points)
         along = (_from_pivots(cameras, points) @ backs[..., None])[..., 0]
         depths = _column(cameras, points, "distance") - along
-        is_behind = depths < cameras[0]._limits(cameras, depths)[0]
+        is_behind = depths < self._limits(cameras, depths)[0]
         if is_behind.any():
             camera = cameras[int(is_behind.any(1).nonzero()[0][0])]
             place = camera.pose()[:3, 3].round(3).tolist()
@@ -412,8 +408,7 @@ class PerspectiveCamera(Camera):
             raise errors.InputError(f"{fault}, {advice}")
         return depths
 
-    @staticmethod
-    def _limits(cameras: Sequence[Any], depths: Points) -> tuple[Any, Any, Any]:
+    def _limits(self, cameras: Sequence[Any], depths: Points) -> tuple[Any, Any, Any]:
         """Return the smallest allowed depth, and the depths of the near and of the far plane."""
         field = partial(_column, cameras, depths)
         return MIN_NEAR_RATIO * field("distance"), field("near"), field("far")

@@ -192,8 +192,7 @@ class PinholeCamera(PerspectiveCamera):
         """Return a camera whose image stays the same, and that attacks turn about the origin."""
         return replace(super().normalized(center, scale), center_x=0.0, center_y=0.0, center_z=0.0)
 
-    @staticmethod
-    def _limits(cameras: Sequence[Any], depths: Points) -> tuple[Any, Any, Any]:
+    def _limits(self, cameras: Sequence[Any], depths: Points) -> tuple[Any, Any, Any]:
         """Return the smallest allowed depth, and depths just around those of the points."""
         library: Any = torch if isinstance(depths, Tensor) else np
         near, far = library.amin(depths, 1)[:, None], library.amax(depths, 1)[:, None]

@@ -180,8 +180,8 @@ def render(
     if backgrounds.ndim > 3 and len(backgrounds) not in (1, view_count):
         raise InputError(f"there are {len(backgrounds)} backgrounds: give 1 or {view_count}")
     # Several views at once form a tall image. Rays and silhouettes need single views.
-    casts_rays = bool(local_lights) or settings.global_illumination
-    at_once = 1 if silhouettes else views_at_once(settings, like.device, casts_rays)
+    is_single = bool(local_lights) or settings.global_illumination or silhouettes
+    at_once = views_at_once(settings, like.device, is_single)
     is_closed = moved_mesh.closed if is_moved else mesh.closed
     fixed_cameras = [camera.fixed() for camera in all_cameras]
     shown = vertices, mesh.faces, fixed_cameras, settings, _choose(rasterizer), is_closed

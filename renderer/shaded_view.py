@@ -101,7 +101,7 @@ class ShadedView:
         """
         fragments = self.fragments
         if not (self.settings.silhouettes and self.is_moved):
-            pixel_radiance = self.radiance()
+            pixel_radiance = self._sum(fragments, has_indirect=True)
             coverage = fragments.coverage.to(pixel_radiance)
             return PixelRadiance(fragments.pixels, coverage, pixel_radiance)
         # Silhouettes move between the mesh and the background, whose linear values are needed.
@@ -126,10 +126,6 @@ class ShadedView:
         coverage = F.pad(fragments.coverage.to(at_pixels), (0, uncovered_count))
         pixel_radiance = F.pad(at_pixels, (0, uncovered_count)) + zeros_with_gradient
         return PixelRadiance(pixels, coverage, pixel_radiance)
-
-    def radiance(self) -> Float[Tensor, "3 P"]:
-        """Compute the linear radiance of the P covered pixels, times their coverage."""
-        return self._sum(self.fragments, has_indirect=True)
 
     def _indirect_radiance(self) -> Float[Tensor, "3 P"] | None:
         """Compute the radiance of bounces and shadows (negative), or None if nothing is added."""

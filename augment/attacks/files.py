@@ -218,7 +218,6 @@ def figure(result: AttackResult, example: int) -> Image.Image:
     of all views is black or white.
     """
     before, after = result.images_in_views_before[example], result.images_in_views[example]
-    drawn = [torch.stack([*map(result.drawn, images)]) for images in (before, after)]
     differences = after - before
     largest = differences.abs().amax((1, 2, 3)).tolist()
     # Differences are enlarged by this factor, at most 255, to fill the range of an image.
@@ -227,14 +226,13 @@ def figure(result: AttackResult, example: int) -> Image.Image:
     captions_before = _captions(result, result.evidence_in_views_before[example], example)
     captions_after = _captions(result, result.evidence_in_views[example], example)
     columns = {
-        "initial": tiles_of(drawn[0], captions_before, SIDE),
-        "adversarial": tiles_of(drawn[1], captions_after, SIDE),
+        "initial": tiles_of(map(result.drawn, before), captions_before, SIDE),
+        "adversarial": tiles_of(map(result.drawn, after), captions_after, SIDE),
         # A difference of 0 becomes the gray value 1/2.
         "difference": tiles_of((1 + scale * differences) / 2, captions, SIDE),
     }
-    first, last = (
-        result.light(values, example) for values in (result.problem.start, result.minimum.values)
-    )
+    first = result.light(result.problem.start, example)
+    last = result.light(result.minimum.values, example)
     if not torch.equal(first[0], last[0]) or first[1] != last[1]:
         cameras = result.problem.scene.cameras[example]
         for title, (light, basis) in {"initial light": first, "adversarial light": last}.items():

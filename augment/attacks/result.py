@@ -244,13 +244,11 @@ class AttackResult(ShortRepr):
         parts = (self.evidence_in_views_before, self.evidence_in_views)
         evidence = torch.stack([part[example, view] for part in parts])
         before_title, after_title = self._titles(evidence, example, view)
-        images = (self.images_in_views_before, self.images_in_views)
-        before_image, after_image = (self.drawn(part[example, view]) for part in images)
         light, basis = self.light(self.minimum.values, example)
         pictures = {
-            f"before: {before_title}": before_image,
+            f"before: {before_title}": self.drawn(self.images_in_views_before[example, view]),
             "light after the attack": light_sphere(light, BALL_SIZE, basis=basis),
-            f"after: {after_title}": after_image,
+            f"after: {after_title}": self.drawn(self.images_in_views[example, view]),
         }
         figure = Figure(figsize=(10, 2.6), layout="constrained")
         *panels, chart = figure.subplots(1, 4, width_ratios=[1, 1, 1, 1.2])

@@ -42,7 +42,7 @@ from renderer.shaded_view import PixelRadiance, ShadedView
 from renderer.surface.albedo import paint_faces, surface_albedo
 from renderer.surface.gloss import Gloss
 from renderer.visibility import Rasterizer
-from renderer.visibility.fragments import Fragments, build_fragments, views_at_once
+from renderer.visibility.fragments import Fragments, build_fragments
 
 
 class Layer(NamedTuple):
@@ -253,10 +253,9 @@ class FrozenTransport:
 
         With a light, only the radiance in this light is kept.
         """
+        assert self._transport is not None  # Only views in environment light are added.
         # None says that shadows and bounces add nothing to the view.
         self.views[key] = None
-        if not self._transport:
-            return
         surface = Surface(self.mesh, fragments.to("cpu"), self._settings)
         if light is not None:
             light = light.cpu().double()
@@ -374,13 +373,13 @@ class DirectRenderer:
         Return also the fraction of each object that nothing hides. It is 0 outside of the view.
         """
         item = self.objects[group.object]
-        mesh, seen, cameras = self._seen(group)
+        mesh, seen = self._seen(group)
         # `item.ends` has the index after the last face of each object.
         # Index of the object that each sample shows. The table comes after the objects.
         ends = torch.tensor(item.ends, device=seen.faces.device)
         owner = torch.searchsorted(ends, seen.faces, right=True)[seen.sample_to_seen_face]
         # Count the samples of each pair of an object and a pixel, shape (O, N, height, width).
-        shape = len(ends) + 1, len(cameras), *self.settings.shape
+        shape = len(ends) + 1, len(seen.cameras), *self.settings.shape
         keys = owner * math.prod(shape[1:]) + seen.pixels[seen.sample_to_pixel]
         counts = torch.bincount(keys, minlength=math.prod(shape)).view(shape)[:-1]
         visible_counts = counts.sum((2, 3))
@@ -388,7 +387,7 @@ class DirectRenderer:
         if item.own is not None:
             # Rasterize each object by itself, to count its samples if nothing hides it.
             parts = np.split(mesh.faces, item.ends)[:-1]
-            shown = cameras, self.settings, self.rasterizer
+            shown = seen.cameras, self.settings, self.rasterizer
             alone = [build_fragments(mesh.vertices, faces, *shown) for faces in parts]
             counts_alone = torch.tensor([[len(each.sample_numbers) for each in of] for of in alone])
         visible = visible_counts / counts_alone.to(ends.device).clamp(min=1)
@@ -403,10 +402,10 @@ class DirectRenderer:
         The depth is the distance from the camera along the viewing direction in world units, and
         normals are along the axes right, up and back of the camera. Both are 0 in other pixels.
         """
-        mesh, seen, cameras = self._seen(group)
+        mesh, seen = self._seen(group)
         fragments = seen.to("cpu")
         # Columns of a pose are the axes right, up and back of the camera, and its position.
-        poses = torch.from_numpy(np.stack([camera.pose()[:3] for camera in cameras]))
+        poses = torch.from_numpy(np.stack([camera.pose()[:3] for camera in seen.cameras]))
         pose = poses[fragments.view_of_face]
         from_camera = pose[:, None, :, 3] - torch.from_numpy(mesh.vertices)[fragments.corners]
         depths = fragments.interpolate(from_camera @ pose[:, :, 2:3])[:, 0]
@@ -425,28 +424,20 @@ class DirectRenderer:
         normals = normalize(normals, dim=1) * fragments.facing[seen_face]
         # Depth and the three components of the normal, shape (4, P).
         at_pixels = torch.cat([depth[None], normals.T])
-        maps = torch.zeros(4, len(cameras) * self.settings.pixel_count, dtype=torch.float32)
+        maps = torch.zeros(4, len(seen.cameras) * self.settings.pixel_count, dtype=torch.float32)
         is_covered = fragments.coverage >= COVERED
         maps[:, fragments.pixels[is_covered]] = at_pixels[:, is_covered].float()
         return maps.view(4, -1, *self.settings.shape).transpose(0, 1)
 
-    def _seen(self, group: Group) -> tuple[Mesh, Fragments, tuple[Camera, ...]]:
-        """Return the mesh of a group, what its cameras see, and the cameras as numbers."""
+    def _seen(self, group: Group) -> tuple[Mesh, Fragments]:
+        """Return the mesh of a group, and what its cameras see."""
         mesh = _moved(self.objects[group.object].mesh, group.changed.vertices)
-        fragments, _ = self._rasterized(group, self.settings)
-        return mesh, fragments, tuple(camera.fixed() for camera in group.cameras)
-
-    def views_at_once(self) -> int:
-        """Return how many views `radiance` renders at once. Rays and silhouettes need one."""
-        if self.settings.silhouettes:
-            return 1
-        casts_rays = self.settings.global_illumination or bool(self.basis.local_lights)
-        return views_at_once(self.settings, self.like.device, casts_rays)
+        return mesh, self._rasterized(group, self.settings)[0]
 
     def radiance(
         self, example: int, group: Group, background: Float[Tensor, "_ pixels"], is_draft: bool
     ) -> PixelRadiance:
-        """Render `views_at_once` views of an object with changed shape, colors, gloss or lamps.
+        """Render the views of a group, of an object with changed shape, colors, gloss or lamps.
 
         Their images are one tall image. All views have the same light or, if the object is matte,
         each may have its own. The result is differentiable in the light and in all changes. With

@@ -28,7 +28,7 @@ from renderer.operators.build import build_operators
 from renderer.operators.stack import ScatterLayers
 from renderer.settings import ImageSettings
 from renderer.visibility import Rasterizer
-from renderer.visibility.fragments import split_views
+from renderer.visibility.fragments import split_views, views_at_once
 
 # Largest total number of pixels of the images that are rendered at a time.
 AT_ONCE = 2**24
@@ -444,12 +444,11 @@ class Scene:
         """
         indices = errors.as_integers("examples", examples)
         errors.require_shape("examples", indices, "count" if count is None else count)
-        if indices.device.type != "cpu" or not len(indices):
-            return indices.to(self.lights.device)
-        low, high = (int(end) for end in indices.aminmax())
-        if low < 0 or high >= len(self):
-            advice = f"give indices from 0 to {len(self) - 1}"
-            raise errors.InputError(f"examples has indices from {low} to {high}: {advice}")
+        if indices.device.type == "cpu" and len(indices):
+            low, high = (int(end) for end in indices.aminmax())
+            if low < 0 or high >= len(self):
+                advice = f"give indices from 0 to {len(self) - 1}"
+                raise errors.InputError(f"examples has indices from {low} to {high}: {advice}")
         return indices.to(self.lights.device)
 
     @property
@@ -562,7 +561,8 @@ class Scene:
             return index, -1 if is_shared else row
 
         images = product(range(len(numbers)), range(self.views))
-        at_once = self._direct_renderer.views_at_once()
+        is_single = self.needs_rays or self.settings.silhouettes
+        at_once = views_at_once(self.settings, self.lights.device, is_single)
         for (index, _), of_mesh in groupby(sorted(images, key=shown), key=shown):
             while group := list(islice(of_mesh, at_once)):
                 rows, views = zip(*group, strict=True)

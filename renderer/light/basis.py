@@ -26,7 +26,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from renderer.light import harmonics
+from renderer.light import harmonics, nonnegative
 from renderer.vectors import Ball, nearest_in_box, unit
 
 
@@ -170,11 +170,7 @@ class Harmonics(Basis):
         The new light has the same mean radiance. Of all such lights, its irradiance
         is the closest to the irradiance of the given light.
         """
-        # Only imported when it is needed, because it also imports SciPy's optimizers, which
-        # takes long.
-        from renderer.light.nonnegative import project_nonnegative
-
-        return project_nonnegative(coefficients)
+        return nonnegative.project_nonnegative(coefficients)
 
     def nearest_nonnegative(
         self, coefficients: Float[Tensor, "... size 3"], within: Ball | None = None
@@ -185,9 +181,7 @@ class Harmonics(Basis):
         coefficients. The mean radiance may change. With `within`, one ball for each light,
         centers must have no negative radiance.
         """
-        from renderer.light.nonnegative import nearest_nonnegative
-
-        return nearest_nonnegative(coefficients, within)
+        return nonnegative.nearest_nonnegative(coefficients, within)
 
 
 # Default basis of environment light.

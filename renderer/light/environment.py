@@ -91,7 +91,7 @@ def negative_fraction(radiance: Float[Tensor, "H W 3"]) -> float:
     return float((-power).clamp(min=0).sum() / magnitude)
 
 
-def read_map(path: str | Path) -> Float[Tensor, "H W 3"]:
+def read_map(path: Path) -> Float[Tensor, "H W 3"]:
     """Read an environment map from a file.
 
     The values of the file are taken as linear RGB radiance. Other primaries than
@@ -104,7 +104,6 @@ def read_map(path: str | Path) -> Float[Tensor, "H W 3"]:
     blue. Radiance that is NaN, infinite or above 1e12 raises
     `InputError`. (The sun has 1.6e9 cd/m².)
     """
-    path = Path(path)
     require_file(path, "give the path of an .npy, .hdr or .exr file")
     with reading(path, "cannot be read as an environment map", "export it again"):
         chromaticities: Sequence[float] = REC_709
@@ -124,7 +123,7 @@ def read_map(path: str | Path) -> Float[Tensor, "H W 3"]:
     return torch.from_numpy(radiance)
 
 
-def read_panorama(path: str | Path) -> Float[Tensor, "H W 3"]:
+def read_panorama(path: Path) -> Float[Tensor, "H W 3"]:
     """Read an environment map that covers the whole sphere and has no negative radiance.
 
     Negative radiance becomes 0 if its magnitude is at most `NEGATIVE` times the largest
@@ -144,7 +143,7 @@ def read_panorama(path: str | Path) -> Float[Tensor, "H W 3"]:
     return radiance.clamp(min=0)
 
 
-def write_map(path: str | Path, radiance: Float[Tensor, "H W 3"]) -> None:
+def write_map(path: Path, radiance: Float[Tensor, "H W 3"]) -> None:
     """Write an environment map to a file.
 
     An .npy or .exr file stores float32 and keeps negative radiance. An .hdr file
@@ -152,7 +151,6 @@ def write_map(path: str | Path, radiance: Float[Tensor, "H W 3"]) -> None:
     file, negative radiance becomes 0 (see `negative_fraction`), and the rounding
     error is at most 2⁻⁸ of the largest channel of a texel.
     """
-    path = Path(path)
     suffix = path.suffix.lower()
     radiance = radiance.detach().cpu().float()
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -28,7 +28,6 @@ patch, with the rays of `renderer.operators.rays`.
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -81,12 +80,14 @@ class Patches:
         patch_of_side: Index of the patch of the front (row 0) and of the back
             (row 1) of each piece, int64, shape (2, F). Both rows are equal for
             a closed mesh.
+        normals: Unit normals of the F pieces.
     """
 
     pieces: Mesh
     view: Fragments
     fractions: Float[Tensor, "S 1"]
     patch_of_side: Int[Tensor, "2 F"]
+    normals: Float[Tensor, "F 3"]
 
     @staticmethod
     def from_mesh(mesh: Mesh, encoding: str) -> "Patches":
@@ -109,7 +110,8 @@ class Patches:
         # both sides are fronts or both are backs, and if the pieces are connected.
         centers = pieces.vertices[pieces.faces].mean(axis=1)
         cells = np.floor((centers - mesh.origin) / math.sqrt(patch_area))
-        keys = np.hstack([cells, np.rint(pieces.face_normals())])[piece_of_side]
+        normals = pieces.face_normals()
+        keys = np.hstack([cells, np.rint(normals)])[piece_of_side]
         _, patch_of_side = np.unique(np.hstack([keys, facing]), axis=0, return_inverse=True)
         # NumPy 2.0.0 returns the shape (S, 1), other versions return (S,).
         patch_of_side = _connected(pieces, piece_of_side, patch_of_side.ravel())
@@ -140,7 +142,7 @@ class Patches:
         # One row for the fronts of all faces, one for their backs. A closed mesh has no row
         # for backs, because rays never hit them. `expand` then repeats the first row.
         patch_by_side = torch.from_numpy(patch_of_side).view(len(sides), -1).expand(2, -1)
-        return Patches(pieces, view, fractions[:, None], patch_by_side)
+        return Patches(pieces, view, fractions[:, None], patch_by_side, torch.from_numpy(normals))
 
     def mean(self, values: Float[Tensor, "S D"]) -> Float[Tensor, "N D"]:
         """Average values over each of the N patches.
@@ -163,16 +165,11 @@ class Patches:
         is_hit = blocked.face != rays.NO_FACE
         piece = blocked.face[is_hit]
         # A ray hits the back of a face if it goes in the direction of the outer normal.
-        is_back = (self._normals[piece] * directions[blocked.direction[is_hit]]).sum(1) > 0
+        is_back = (self.normals[piece] * directions[blocked.direction[is_hit]]).sum(1) > 0
         patch = self.patch_of_side[is_back.long(), piece]
         # `csr_matrix` adds up entries with the same pixel and patch.
         entries = (weights[is_hit].numpy(), (blocked.row[is_hit].numpy(), patch.numpy()))
         return csr_matrix(entries, (len(blocked.pixels), len(self.view.pixels)))
-
-    @cached_property
-    def _normals(self) -> Tensor:
-        """Unit normals of the F pieces, shape (F, 3)."""
-        return torch.from_numpy(self.pieces.face_normals())
 
 
 def _connected(

@@ -375,12 +375,12 @@ def samples_on_gpu(device: torch.device) -> int:
     return int(MEMORY_FRACTION * memory / SAMPLE_BYTES)
 
 
-def views_at_once(settings: ImageSettings, device: torch.device, casts_rays: bool) -> int:
+def views_at_once(settings: ImageSettings, device: torch.device, is_single: bool) -> int:
     """Return how many views are shaded at once. Few samples take as long as many.
 
-    Rays need single views.
+    Rays and the gradients of silhouettes need single views.
     """
-    if casts_rays:
+    if is_single:
         return 1
     samples = samples_on_gpu(device) if device.type == "cuda" else SAMPLES_ON_CPU
     return max(1, samples // (settings.pixel_count * settings.samples**2))

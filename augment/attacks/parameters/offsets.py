@@ -3,7 +3,6 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -133,17 +132,18 @@ class Pixels(Parameter):
     def __init__(self, scene: Scene, settings: StepSettings, is_alone: bool = False):
         self._images_shape = (scene.views, 3, *scene.settings.shape)
         self._scene = scene
-        self._is_alone = is_alone
         start = scene.lights.new_zeros(len(scene), math.prod(self._images_shape))
+        # Images of all examples before the attack, or NaN until they are needed.
+        self._images = torch.full_like(start, math.nan) if is_alone else None
         super().__init__(settings, start)
 
     def project_feasible(
         self, values: Values, within: Ball | None = None, examples: Examples | slice = slice(None)
     ) -> Values:
         """Keep the sums of images and offsets in [0, 1], if nothing else changes the images."""
-        if not self._is_alone:
+        if self._images is None:
             return super().project_feasible(values, within)
-        images = self._images_of(examples)
+        images = self._images_of(self._images, examples)
         # A sum beyond the limits by rounding would have a gradient of zero.
         low, high = -relu(images - ROUNDING), relu(1 - ROUNDING - images)
         return nearest_in_box(values, low, high, within)
@@ -155,17 +155,12 @@ class Pixels(Parameter):
         """
         return replace(conditions, pixels=values.unflatten(1, self._images_shape))
 
-    def _images_of(self, examples: Examples | slice) -> Values:
-        """Return the images of examples before the attack, one row for each."""
+    def _images_of(self, kept: Float[Tensor, "_ D"], examples: Examples | slice) -> Values:
+        """Return the images of examples before the attack, one row for each, and keep them."""
         rows = torch.arange(len(self._scene), device=self.start.device)[examples]
-        missing = rows[self._images[rows, 0].isnan()]
+        missing = rows[kept[rows, 0].isnan()]
         with torch.no_grad():
             for group in missing.split(self._scene.group_size) if len(missing) else ():
                 images = self._scene.render(self._scene.conditions(group), group)
-                self._images[group] = images.flatten(1)
-        return self._images[rows]
-
-    @cached_property
-    def _images(self) -> Values:
-        """Images of all examples before the attack, or NaN until they are needed."""
-        return torch.full_like(self.start, math.nan)
+                kept[group] = images.flatten(1)
+        return kept[rows]

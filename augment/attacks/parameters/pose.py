@@ -17,7 +17,6 @@ from augment.attacks.objective import Examples, Values
 from augment.attacks.parameters.parameter import Parameter
 from augment.scene.objects import Conditions
 from augment.scene.scene import Scene
-from renderer.camera import PerspectiveCamera
 from renderer.errors import InputError
 from renderer.vectors import rotation_matrices
 
@@ -73,8 +72,7 @@ class Pose(Parameter):
         units += [settings.view] * 2 + [math.log1p(settings.distance)]
         self._unit = torch.tensor(units, dtype=torch.float64).to(scene.lights)
         all_cameras = chain.from_iterable(scene.cameras)
-        cameras = [camera for camera in all_cameras if isinstance(camera, PerspectiveCamera)]
-        distances = [camera.distance for camera in cameras]
+        distances = [camera.distance for camera in all_cameras if camera.has_perspective]
         object_radius = float(scene.vertices.norm(dim=-1).max()) + settings.shift
         # Logarithm of the factor by which the object can grow before it meets the nearest
         # perspective camera. It is infinite if there is no such camera.

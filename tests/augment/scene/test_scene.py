@@ -314,7 +314,7 @@ def test_views_that_are_rendered_together_are_those_that_are_rendered_alone(
     conditions = replace(scene.conditions(examples), vertices=vertices)
     found = []
     for count in (1, at_once):
-        monkeypatch.setattr(render.DirectRenderer, "views_at_once", lambda self, count=count: count)
+        monkeypatch.setattr("augment.scene.scene.views_at_once", lambda *_, count=count: count)
         images = scene.render(conditions, examples)
         found.append((images, *torch.autograd.grad(images.square().sum(), vertices)))
     for alone, together in zip(*found, strict=True):

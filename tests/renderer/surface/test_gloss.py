@@ -469,7 +469,7 @@ class GlossyView:
     LAMP = Lamps(((1.5, 0.4, 1.2),), radius=0.0)
 
     def __init__(self, normals: str, camera: Camera) -> None:
-        self.mesh = normalize(solid("apple"))
+        self.mesh, self.camera = normalize(solid("apple")), camera
         self.settings = ImageSettings(12, 2, normals=normals)
         self.rays = Rays(self.mesh)
         self.view = fragments_of(self.mesh, camera, self.settings)
@@ -492,7 +492,8 @@ class GlossyView:
         light = SplitLight(values["environment"], [(self.LAMP, values["lamp"])])
         lamp_view = LocalLightView(self.rays, Surface(*seen, gloss))
         view = ShadedView(*seen, values["albedo"], light, lamp_view, gloss=gloss)
-        return (view.radiance() * self.upstream).sum()
+        shown = view.pixel_radiance(self.camera, torch.zeros(3, self.settings.pixel_count))
+        return (shown.radiance * self.upstream).sum()
 
 
 @pytest.mark.parametrize(
