@@ -26,6 +26,7 @@ import numpy as np
 import safetensors.torch
 import torch
 from torch import Tensor, nn
+from torch.nn.modules.utils import consume_prefix_in_state_dict_if_present
 from torch.utils._pytree import tree_leaves, tree_map
 
 from augment import classifier as classifiers
@@ -462,13 +463,15 @@ def _state_dict(content: Any) -> State:
     return content
 
 
-def _without_prefixes(state: State) -> State:
+def _without_prefixes(state: Any) -> State:
     """Remove prefixes such as "module." from the names of weights, if all names have them."""
     # torch.optim.swa_utils.AveragedModel counts averages beside the weights.
-    state = {key: value for key, value in state.items() if key != "n_averaged"}
+    state.pop("n_averaged", None)
     for prefix in _PREFIXES:
         if state and all(key.startswith(prefix) for key in state):
-            return _without_prefixes({key.removeprefix(prefix): state[key] for key in state})
+            # This keeps the versions of modules, without which MNASNet cannot be loaded.
+            consume_prefix_in_state_dict_if_present(state, prefix)
+            return _without_prefixes(state)
     return state
 
 

@@ -76,7 +76,10 @@ def measure(parameter: str, words: list[str]) -> None:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
+    if "--help" in sys.argv:
+        sys.exit(print(__doc__))
     print("|attack on|successes|gradients|whole, s|first step, s|passes alone, s|ratio|")
     print("|-|-|-|-|-|-|-|")
-    for name in PARAMETERS:
-        measure(name, sys.argv[1:])
+    with main.handle_errors():
+        for name in PARAMETERS:
+            measure(name, sys.argv[1:])

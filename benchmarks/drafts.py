@@ -9,7 +9,8 @@ turns as a draft and exactly. CPU seconds are those of an image and its gradient
 error of a draft is the rms difference of the image values.
 
 With `success`, the examples that are classified correctly are attacked in drafts of 2², 3², 4² and
-8² samples for each pixel, with the same start and steps. A success is one in the exact images.
+8² samples for each pixel, with the same start and steps. A draft has at most renderer.samples², so
+set that to 8. A success is one in the exact images.
 """
 
 import sys
@@ -108,7 +109,10 @@ def count_successes(words: list[str]) -> None:
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    if sys.argv[1:2] == ["success"]:
-        count_successes(sys.argv[2:])
-    else:
-        measure(sys.argv[1:])
+    if "--help" in sys.argv:
+        sys.exit(print(__doc__))
+    with main.handle_errors():
+        if sys.argv[1:2] == ["success"]:
+            count_successes(sys.argv[2:])
+        else:
+            measure(sys.argv[1:])

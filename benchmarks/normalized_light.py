@@ -243,6 +243,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     add("--data", type=Path)
     add("--renders", type=Path, required=True)
     options = parser.parse_args(argv)
+    if options.command == "render" and options.data is None:
+        parser.error("render requires --data")
     commands = {"render": render, "choose": choose, "test": test}
     commands[options.command](options)
 

@@ -123,7 +123,12 @@ def load(folder: Path, size: int, every: int) -> tuple[Tensor, Tensor]:
 
 def class_of(name: str) -> int:
     """Return the index of the class with which the name of a photograph begins."""
-    return int(name.partition("_")[0])
+    number = name.partition("_")[0]
+    if not number.isdecimal():
+        raise SystemExit(
+            f"error: {name} does not begin with the index of its class, as in 007_cock"
+        )
+    return int(number)
 
 
 def score(

@@ -702,6 +702,8 @@ def main(argv: Sequence[str] | None = None) -> None:
     if options.command == "test" and not options.table:
         parser.error("test requires --table NAME, which docs/test_evaluations.csv records")
     if options.command == "make":
+        if options.data is None or options.packages is None:
+            parser.error("make requires --data and --packages")
         make(options)
     else:
         score(options)

@@ -73,6 +73,10 @@ def check(result: AttackResult) -> dict[str, Any]:
         (1.0, True)
     """
     require_result(result)
+    settings = result.settings
+    # The starts of the attack count as one start with all of their steps or queries.
+    steps = (1 + settings.restarts) * settings.max_steps
+    result = replace(result, settings=replace(settings, restarts=0, max_steps=steps))
     minimum = result.minimum
     is_clean = result.clean_correct
     # A successful example counts as one with a lower cost, even if its cost is higher.

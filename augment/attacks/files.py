@@ -142,8 +142,10 @@ def _write_example(
     write_image(path.with_suffix(".png"), figure(result, example))
     adversary = Adversary.of(scene, example, after, *images)
     # An index would be another class of another network.
-    label = result.classifier.classes[result.classifier.label(adversary.shown.label)]
-    adversary = replace(adversary, shown=replace(adversary.shown, label=label))
+    names = result.classifier.classes
+    label = names[result.classifier.label(adversary.shown.label)]
+    others = [(names[of] if isinstance(of, int) else of, x) for of, x in adversary.shown.others]
+    adversary = replace(adversary, shown=replace(adversary.shown, label=label, others=others))
     light_numbers = write_adversary(adversary, path)
     # The files of an adversary have the light after the attack. Add that before it.
     light_before, basis_before = result.light(problem.start, example)

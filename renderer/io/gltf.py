@@ -112,7 +112,7 @@ def _read_part(
     # Linear red, green, blue and alpha of each vertex. Without COLOR_0, they are 1.
     colors = np.ones((len(positions), 4))
     # The file may leave out alpha, the fourth column.
-    file_colors = attributes.get("COLOR_0", colors)
+    file_colors = colors if material.is_emitted else attributes.get("COLOR_0", colors)
     colors[:, : file_colors.shape[1]] = np.clip(file_colors, 0, 1)
     colors *= material.color
     if material.placement is not None and uv_name not in attributes:

@@ -275,6 +275,7 @@ class Material:
         alpha: Alpha of the texture, uint8, shape (H, W). None if it is 1 everywhere.
         gloss: Roughness, metallic and specular factor, shape (3,). None for a matte surface.
         gloss_texture: Factors of roughness and metallic, uint8, shape (H, W, 2), or None.
+        is_emitted: Whether the color is emitted light, which colors of vertices leave alone (3.9).
     """
 
     color: Float[np.ndarray, " 4"]
@@ -285,6 +286,7 @@ class Material:
     alpha: UInt8[np.ndarray, "H W"] | None = None
     gloss: Float[np.ndarray, " 3"] | None = None
     gloss_texture: UInt8[np.ndarray, "_ _ 2"] | None = None
+    is_emitted: bool = False
 
     def placed(self, uvs: np.ndarray, file: GltfFile) -> tuple["Material", np.ndarray]:
         """Convert texture coordinates (V, 2) of the file to those of `Mesh`.
@@ -379,7 +381,7 @@ def ignored_features(tree: dict[str, Any]) -> list[str]:
     used = set(tree.get("extensionsUsed", ())) - READ
     for name in {*tree.get("extensionsRequired", ()), *(REFUSED & used)} - READ:
         if not name.startswith(HARMLESS):
-            raise ValueError(f"it needs the extension {name}: export the mesh without it")
+            raise ValueError(f"it uses the extension {name}: export the mesh without it")
     return sorted(features | used)
 
 
@@ -413,7 +415,7 @@ def read_material(file: GltfFile, index: int | None) -> Material:
     if _emits_its_color(entry):
         file.file.assume("the light that a black material emits is taken as its color")
         emission = entry | {"emissiveFactor": [*entry["emissiveFactor"], 1.0]}
-        material = _with_color(material, file, emission, "emissive")
+        material = _with_color(replace(material, is_emitted=True), file, emission, "emissive")
     else:
         material = _with_color(material, file, model, "baseColor")
     if not file.file.gloss:

@@ -1,6 +1,7 @@
 """Averages of the weights of a network over the training, and interpolation between weights."""
 
 from collections.abc import Mapping
+from copy import copy
 from typing import Any, cast
 
 import torch
@@ -111,7 +112,9 @@ class Averages:
     def weights(self) -> dict[str, torch.Tensor]:
         """Return a copy of the weights of the selected network on the CPU, by name."""
         state = self.selected.network.state_dict()
-        return {name: value.to("cpu", copy=True) for name, value in state.items()}
+        # A dictionary of its own would lose the versions of modules, which MNASNet needs.
+        state.update({name: value.to("cpu", copy=True) for name, value in state.items()})
+        return state
 
     def state_dict(self) -> dict[str, Any]:
         """Return the states of the moving average and of the soup for a checkpoint."""
@@ -172,8 +175,9 @@ def mix(initial: Weights, trained: Weights, factor: float) -> dict[str, Tensor]:
     The factor 0 gives `initial`. Integers, such as counters, are those of `trained`.
     """
     floats = {name: value for name, value in trained.items() if value.is_floating_point()}
-    mixed = {name: initial[name].to(value).lerp(value, factor) for name, value in floats.items()}
-    return {**trained, **mixed}
+    mixed: Any = copy(trained)
+    mixed.update({name: initial[name].to(of).lerp(of, factor) for name, of in floats.items()})
+    return mixed
 
 
 def predict(

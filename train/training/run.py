@@ -250,7 +250,9 @@ class Run:
         path = self.folder / WEIGHTS
         # The weights have the names of the user's own network, without wrappers of this library.
         raw = wrappers.unwrapped(self.trainer.selected.network, own_alone=True)
-        checkpoints.save(path, {name: value.cpu() for name, value in raw.state_dict().items()})
+        state = raw.state_dict()
+        state.update({name: value.cpu() for name, value in state.items()})
+        checkpoints.save(path, state)
         console.info("network.load_state_dict(torch.load(%r)) loads the result", str(path))
         # Settings of the wrapper that normalizes the light of images. None without one.
         light = exposure.light_settings(self.trainer.selected.network)
