@@ -297,6 +297,8 @@ def relight_photographs(
         if slides is not None:
             advice = "give nb.lights.ProjectedSlide(slides) among the lights"
             raise InputError(f"slides are not used with lights: {advice}", "slides")
+        if isinstance(photographs, np.ndarray):
+            photographs = torch.from_numpy(np.require(photographs, requirements=["C", "W"]))
         with seeded(stream_seed(seed, "lights")):
             return RandomLighting(lights, strength=strength)(photographs)
     if strength != 1.0:

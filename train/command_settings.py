@@ -383,7 +383,9 @@ class RenderSettings(TaskSettings):
         list(DATA_SET_MAPS), "Further images of each render.", choices=DATA_SET_MAPS
     )
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
-    shards: int = setting(1, "Parts of the work that --multirun shard=0,1,... shares.")
+    shards: int = setting(
+        1, "Parts of the work that --multirun shard=0,1,... shares.", within=(1, None)
+    )
     shard: int = setting(0, "Index of the part that this process renders.", within=(0, None))
     out: str = setting(REQUIRED, "Folder of the data set. A stopped command continues in it.")
     augment: augmentation.AugmentationSettings = setting(
@@ -422,6 +424,9 @@ class RenderSettings(TaskSettings):
         parts = [*self.splits.values()] if isinstance(self.splits, dict) else []
         if not all(is_number(part) and part >= 0 for part in parts) or not sum(parts):
             raise self.wrong("splits", "must be parts and their fractions, such as {train: 1}")
+        names = map(str, self.splits)
+        if any(name in ("", "..") or Path(name).name != name for name in names):
+            raise self.wrong("splits", "must name parts without folders, such as {train: 1}")
         common.prepare_attack(self, self.augment.attack.parameters)
         # The default depends on the network. `require_counting` refuses other modes.
         if self.network and self.augment.mode == "random":

@@ -10,6 +10,7 @@ import pytest
 import safetensors.torch
 import torch
 from torch import nn
+from torchvision.models import mnasnet0_5
 
 from augment.files import NetworkFacts, read_weights
 from augment.sources import load_classifier
@@ -227,12 +228,13 @@ def test_the_weights_of_a_checkpoint_count_and_an_average_is_named(
     assert [names[1] in record.getMessage() for record in caplog.records] == [True] * has_average
 
 
-def test_weights_of_an_average_by_torch_are_read(tmp_path):
-    average = torch.optim.swa_utils.AveragedModel(nn.Linear(3, 2))
-    torch.save(average.state_dict(), tmp_path / "a.pth")
-    network = nn.Linear(3, 2)
+def test_weights_of_an_average_by_torch_are_read_with_the_versions_of_modules(tmp_path):
+    """MNASNet cannot load a state dict without the versions."""
+    network = mnasnet0_5(num_classes=2)
+    average = torch.optim.swa_utils.AveragedModel(mnasnet0_5(num_classes=2))
+    torch.save({"state_dict": average.state_dict()}, tmp_path / "a.pth")
     network.load_state_dict(read_weights(tmp_path / "a.pth"))
-    assert torch.equal(network.weight, average.module.weight)
+    assert torch.equal(network.layers[0].weight, average.module.layers[0].weight)
 
 
 def test_the_suffix_of_safetensors_may_be_in_upper_case(tmp_path):

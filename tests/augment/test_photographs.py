@@ -192,6 +192,8 @@ def test_relit_photographs_repeat_with_their_seed(photographs):
     # Flipped twice, the array has negative strides, as images of OpenCV in RGB have.
     array = photographs.flip(1).numpy()[:, ::-1]
     assert torch.equal(relight_photographs(array, seed=1, slides=array), first)
+    linear = [relight_photographs(each, lights=["linear"]) for each in (array, photographs)]
+    assert torch.equal(*linear)
     other = relight_photographs(photographs, seed=2, slides=photographs)
     assert first.dtype == torch.uint8
     assert torch.equal(first, again)

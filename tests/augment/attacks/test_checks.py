@@ -56,6 +56,12 @@ def test_a_success_counts_at_the_very_last_step_and_if_a_margin_sends_it_on(atta
     assert augment.check(attacked(SMALL_STEPS, max_steps=last - 1))["success"] == 0
 
 
+def test_checks_count_the_steps_of_all_starts(attacked):
+    step = StepSettings(radius=0.1, step_size=0.01)
+    found = augment.check(attacked({"lighting": step}, max_steps=2, restarts=2))
+    assert [*found["success_by_steps"]] == [6, 18, 60]
+
+
 def test_random_search_that_does_as_well_is_a_warning(attacked):
     """The classifier knows images of almost exactly one brightness alone."""
     brightness = attacked("lighting", max_steps=0).images_before.mean()

@@ -574,6 +574,17 @@ def test_a_texture_that_is_shown_without_shading_is_the_color(tmp_path):
     assert_allclose(linear(mesh.corner_colors), np.broadcast_to([1, 1, 0.5], (2, 3, 3)), atol=1e-6)
 
 
+@pytest.mark.filterwarnings("ignore:.*black material")
+def test_colors_of_vertices_do_not_change_emitted_light(tmp_path):
+    """Section 3.9.2 multiplies them with the base color alone."""
+    black = {"baseColorFactor": [0, 0, 0, 1]}
+    gltf = Gltf().square(pbrMetallicRoughness=black, emissiveFactor=[1, 0.5, 0.25])
+    halves = gltf.array(np.full((4, 3), 0.5, np.float32))
+    gltf.tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = halves
+    colors = linear(gltf.load(tmp_path).corner_colors)
+    assert_allclose(colors, np.broadcast_to([1, 0.5, 0.25], (2, 3, 3)), atol=1e-6)
+
+
 @pytest.mark.parametrize(
     "entries",
     [

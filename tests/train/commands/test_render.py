@@ -334,6 +334,12 @@ def test_the_parts_of_the_command_line_replace_those_of_the_default():
     assert main.read(["out=out", "splits={train: 1}"]).splits == {"train": 1}
 
 
+@pytest.mark.parametrize("name", ["../photos", "a/b", ".."])
+def test_a_part_cannot_be_in_another_folder(name):
+    with pytest.raises(InputError, match="splits"):
+        RenderSettings(out="out", splits={name: 1})
+
+
 @pytest.mark.ecosystem
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("splits", [{"train": 2, "val": 1}, {"train": 1}])
