@@ -5,6 +5,7 @@ import csv
 import pytest
 import torch
 from torch.distributions import Categorical, kl_divergence
+from torchvision.models import mnasnet0_5
 
 import norm_balls as nb
 from augment.random_streams import generator
@@ -21,7 +22,7 @@ from train.run_folder import BEFORE, BEST, LAST, read_metrics
 from train.settings import PHOTOGRAPHS_FIRST, TrainSettings
 from train.training import run
 from train.training.augmentations import Augmentation, relit
-from train.training.averages import FACTORS, INTERPOLATION, interpolate, predict
+from train.training.averages import FACTORS, INTERPOLATION, interpolate, mix, predict
 from train.training.recipe import TrainingLoss
 
 GRAY = Split(torch.full((64, 3, 24, 24), 180, dtype=torch.uint8), torch.zeros(64).long())
@@ -163,6 +164,14 @@ def test_the_interpolation_minimizes_the_loss_with_the_larger_weight(weights, ex
     recipe = TrainSettings(augmentation="low_light", **dict(zip(names, weights, strict=True)))
     _, factor = interpolate(initial, network(0.0), trained, GRAY, recipe, 0)
     assert factor == expected
+
+
+def test_interpolated_weights_keep_the_versions_of_modules():
+    """MNASNet cannot load a state dict without the versions."""
+    first, last = (mnasnet0_5(num_classes=2) for _ in range(2))
+    mixed = mix(first.state_dict(), last.state_dict(), 0.25)
+    first.load_state_dict(mixed)
+    assert torch.equal(first.layers[0].weight, mixed["layers.0.weight"])
 
 
 @pytest.mark.parametrize("weight", [2.0, 0.0])
