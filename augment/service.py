@@ -323,6 +323,9 @@ class AugmentationService:
             advice = "resume with the same meshes, labels, views and light"
             raise InputError(f"state is of another scene, or not of a service: {advice}")
         values = state.get("values")
+        if values is not None and self.scene is not None:
+            start = build_problem(self.settings.attack, self.scene).start
+            require_shape("state['values']", values, *start.shape)
         self._last_values = None if values is None else values.to(self.labels.device)
 
     @cached_property

@@ -49,11 +49,10 @@ class Camera(ABC):
     """Camera that takes images of a scene around the origin.
 
     The camera lies at a polar angle from +z and at an azimuth from +x toward
-    +y. Fields can be numbers, or tensors, arrays and lists of one number. Images
-    are differentiable with respect to fields that are tensors. Derivatives with
-    respect to an angle are per degree. They include moving outlines and
-    changes of highlights with the direction of view only if `nb.render` gets
-    `silhouettes=True`.
+    +y. Fields can be numbers, or tensors, arrays and lists of one number. If
+    `nb.render` gets `silhouettes=True`, images are differentiable with respect to
+    fields that are tensors. Otherwise they have no such gradient. Derivatives with
+    respect to an angle are per degree.
 
     Attributes:
         polar: Polar angle in degrees, within two turns.

@@ -8,9 +8,10 @@ The renderers differ in these ways:
 
 - The radiance of a diffuse surface is the irradiance times albedo / π in
   Mitsuba, and the irradiance times the albedo in our renderer. The lights for
-  Mitsuba are therefore multiplied by π. Without bounces, they are also multiplied
-  by the albedo scale. With bounces, the colors of the materials are, because the
-  albedo scale applies again at each bounce.
+  Mitsuba are therefore multiplied by π. Without bounces and gloss, they are also
+  multiplied by the albedo scale. With bounces, the colors of the materials are,
+  because the albedo scale applies again at each bounce. So they are with gloss,
+  because specular reflection does not have the albedo.
 - Mitsuba always has shadows. If our render has none, a concave mesh is darker in
   Mitsuba.
 - Specular reflection is the plugin `principled`, with the same lobe. Below its
@@ -69,9 +70,6 @@ PLUGINS = {
     "sampler": ("multijitter",),
 }
 PLUGIN_TAGS = {plugin: tag for tag, plugins in PLUGINS.items() for plugin in plugins}
-# Smallest number by which specular factors are divided.
-# They are divided by the scale of the lights, which can be 0.
-MIN_DIVISOR = 1e-6
 # Smallest parameter `specular` of Mitsuba's material
 # "principled". With 0, metals would reflect nothing.
 # With 1e-4, the reflectance at normal incidence is 8e-6.
@@ -245,7 +243,8 @@ def write_mitsuba_scene(
     """
     folder.mkdir(parents=True, exist_ok=True)
     # The first lines of this module explain these factors.
-    color_scale, light_scale = (albedo_scale, 1.0) if settings.bounces else (1.0, albedo_scale)
+    is_colored = settings.bounces or mesh.gloss is not None
+    color_scale, light_scale = (albedo_scale, 1.0) if is_colored else (1.0, albedo_scale)
     local_emitters = _local_emitters(folder, local_lights, light_scale)
     sky = environment({"filename": light}, math.pi * light_scale)
     # Rays with random directions from surfaces find the environment
@@ -256,7 +255,7 @@ def write_mitsuba_scene(
     sensors = [{**sensor_of(camera, settings.size), "sampler": sampler} for camera in cameras]
     normals = mesh.written_normals(settings.normals)
     shapes = [
-        _write_part(folder, number, part, settings.encoding, light_scale, color_scale)
+        _write_part(folder, number, part, settings.encoding, color_scale)
         for number, part in enumerate(split_parts(mesh, normals, settings.encoding))
     ]
     method = integrator(settings.bounces, emitter_samples=1 if local_emitters else 0)
@@ -308,12 +307,10 @@ def _local_emitters(folder: Path, lights: Sequence[LitBasis], albedo_scale: floa
     return emitters
 
 
-def _write_part(
-    folder: Path, number: int, part: Part, encoding: str, light_scale: float, color_scale: float
-) -> Scene:
+def _write_part(folder: Path, number: int, part: Part, encoding: str, color_scale: float) -> Scene:
     """Write a part to files such as part_0.ply and texture_0.png, and return its Mitsuba entry.
 
-    Lights are multiplied by `light_scale`, and the colors of the part by `color_scale`.
+    The colors of the part are multiplied by `color_scale`.
     """
     import trimesh
 
@@ -356,10 +353,8 @@ def _write_part(
     if gloss is not None:
         roughness, metallic, specular_factor = gloss.tolist()
         # Mitsuba's reflectance at normal incidence is 0.08 · specular. It must be 0.04 times the
-        # specular factor, for a refractive index of 1.5. If the lights of the scene are multiplied
-        # by the albedo scale, the reflectance is divided by it.
-        specular = specular_factor / 2 / max(light_scale, MIN_DIVISOR)
-        specular = min(max(specular, MIN_SPECULAR), 1.0)
+        # specular factor, for a refractive index of 1.5.
+        specular = max(specular_factor / 2, MIN_SPECULAR)
         material = {"type": "principled", "base_color": albedo, "specular": specular}
         # A metal has no coat and needs the full albedo, but the albedo was multiplied by a factor.
         # A larger value for metallic compensates for this.

@@ -363,10 +363,11 @@ class ExperimentSettings(NetworkSettings):
         folders = self.photos.values() if isinstance(self.photos, dict) else [self.photos or ""]
         if not all(isinstance(folder, str) for folder in folders):
             raise self.wrong("photos", "must be a folder, or a mapping of names to folders")
+        reserved = (*RESERVED, *self.compare)
         for name in self.scored_folders:
             # Each name becomes the name of a sub-folder of the run.
-            if not re.fullmatch(r"\w[\w-]*", name) or name in RESERVED:
-                advice = f"choose letters, digits, _ and -, and none of {', '.join(RESERVED)}"
+            if not re.fullmatch(r"\w[\w-]*", name) or name in reserved:
+                advice = f"choose letters, digits, _ and -, and none of {', '.join(reserved)}"
                 raise InputError(f"photos has the name {name!r} for a folder: {advice}", "photos")
         renders_meshes = self.augment.renders and self.augment.mode != "folder"
         if renders_meshes:

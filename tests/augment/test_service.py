@@ -19,6 +19,7 @@ from augment.scene.scene import Scene
 from augment.service import AugmentationService
 from augment.settings import SceneSettings
 from augment.tasks.classification import complementary_label
+from renderer.errors import InputError
 from renderer.light.files import probe
 from renderer.solids import solid
 
@@ -232,6 +233,16 @@ def test_a_warm_start_continues_the_last_attack(serve, model):
     assert second["loss_before"] == pytest.approx(first["loss"], rel=8 * EPS32)
     assert second["attack_success_before"] == first["attack_success"]
     assert second["loss"] > first["loss"]
+
+
+def test_the_state_of_another_attack_is_refused_when_it_is_loaded(serve, model):
+    service, other = (
+        serve(**WARM, attack=TrainingAttackSettings(**{name: StepSettings("l2", 0.1)}))
+        for name in ("lighting", "albedo")
+    )
+    service.regenerate(model, 0)
+    with pytest.raises(InputError, match="state"):
+        other.load_state_dict(service.state_dict())
 
 
 def test_a_warm_start_in_another_environment_lies_in_the_ball_around_it(serve):

@@ -112,6 +112,17 @@ def test_gloss_survives_in_a_mitsuba_scene(tmp_path):
         assert error < 0.8 * relative_error(render(with_texture), expected)
 
 
+@pytest.mark.parametrize("metallic", [0.0, 1.0])
+def test_a_dark_albedo_scale_leaves_white_reflection_as_it_is(tmp_path, metallic):
+    mesh = Gloss(0.5, metallic).on(normalize(ball()))
+    light = load_light("uniform")
+    settings = ImageSettings(24, 4)
+    [expected] = path_traced(tmp_path, mesh, CAMERAS[:1], light, settings, albedo_scale=0.1)
+    found = image_of(operator_of(mesh, CAMERAS[0], settings, albedo_scale=0.1), light)
+    found_mean, expected_mean = (image[:3].mean() for image in (found, expected))
+    assert abs(found_mean / expected_mean - 1) < 0.06
+
+
 def test_a_scene_is_rendered_on_a_single_core_too(tmp_path):
     """With a single thread, Mitsuba would wait forever for its own reader of .exr files."""
     camera = OrthographicCamera(57.3, 0.0, 2.0)

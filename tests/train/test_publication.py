@@ -78,15 +78,15 @@ def test_several_labels_have_the_thresholds_that_each_has_alone(finished, photos
         nb.publish(finished, tmp_path / label, label=label, **options)
         alone = load_run(tmp_path / label)
         (expected,) = alone.operating_points
-        assert point.label == label
-        assert point.threshold == expected.threshold
+        assert point == expected
         assert torch.equal(network.detect(images, label), alone.detect(images))
     with pytest.raises(InputError, match="orange, apple"):
         network.detect(images)
     labels = list(reversed(LABELS))
     nb.evaluate(network, photos, labels, out=tmp_path / "scores")
     summary = json.loads((tmp_path / "scores" / "summary.json").read_text())
-    assert [point["label"] for point in summary["operating_point"]] == labels
+    points = [(point["label"], point["in_sample"]) for point in summary["operating_point"]]
+    assert points == [(label, True) for label in labels]
 
 
 def test_a_network_that_cannot_be_built_is_not_published(finished, tmp_path):

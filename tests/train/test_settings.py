@@ -82,6 +82,7 @@ def test_training_takes_the_parameters_of_the_attack_command():
         ),
         (["scene.projector.pixels=abc"], "scene.projector.pixels is 'abc'"),
         (["photos={renders: /x}"], "photos has the name 'renders'"),
+        (["photos={random: /x}", "compare=[random]"], "photos has the name 'random'"),
         (["experiment=harden", *OTHER_DATA], "network is empty: give a run or "),
         # These lights have no factors for gradient steps.
         ([*PHOTOGRAPHS, "experiment=stripes", "train.relight_steps=1"], "train.relight_steps"),

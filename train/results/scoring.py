@@ -10,7 +10,7 @@ threshold on its log-odds. An image above the threshold counts as detected.
 import hashlib
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from functools import cached_property
@@ -112,7 +112,7 @@ class Predictor:
         return FolderPredictions(folder, ranked, images, *facts)
 
 
-def _hash(folder: Path, photographs: Sequence[Photograph], labels: Sequence[str]) -> str:
+def _hash(folder: Path, photographs: Iterable[Photograph], labels: Sequence[str]) -> str:
     """Hash the positive classes and the photographs with SHA-256."""
     digest = hashlib.sha256("\n".join(labels).encode())
     for photograph in photographs:
@@ -268,8 +268,13 @@ class Scores(ShortRepr):
         The value "in_sample" tells whether an operating point was chosen on the
         same images that are scored.
         """
-        images_hash = self.predicted.images_hash
-        return [asdict(point) | {"in_sample": point.images == images_hash} for point in self.points]
+        shown = self.predicted
+        photographs = shown.predictions.photograph[: len(shown.images)]
+        return [
+            asdict(point)
+            | {"in_sample": point.images == _hash(shown.folder, photographs, [point.label])}
+            for point in self.points
+        ]
 
     def to_summary(self) -> dict[str, Any]:
         """Convert the scores to the content of summary.json."""
@@ -375,7 +380,7 @@ def choose_operating_points(
         higher = rows.log_odds[rows.log_odds > threshold]
         if len(higher):
             threshold = (threshold + higher.min()) / 2
-        chosen_on = (folder.resolve().name, predicted.images_hash, count)
+        chosen_on = (folder.resolve().name, _hash(folder, rows.photograph, [name]), count)
         points.append(OperatingPoint(name, float(threshold), rate, *chosen_on))
     return points
 
