@@ -431,7 +431,9 @@ class Classifier(TaskNetwork):
 def as_class_names(name: str, classes: object) -> tuple[str, ...]:
     """Convert a list of names of classes to a tuple of strings."""
     expected = "a list of the names of the classes, in the order of the logits"
-    return tuple(map(errors.composed, errors.as_list(name, classes, str, expected)))
+    names = errors.as_list(name, classes, str, expected)
+    # Strings of NumPy are of a class of their own, which files of settings cannot hold.
+    return tuple(str(errors.composed(item)) for item in names)
 
 
 def remembering(classifier: TaskNetwork) -> TaskNetwork:

@@ -19,7 +19,7 @@ from augment.classifier import IMAGENET, USUAL_SIZE, TaskNetwork, as_network, me
 from augment.files import NetworkFacts, import_package, name_error, reading_network
 from augment.network import FILE, ChannelNormalization, Network
 from renderer.errors import InputError
-from renderer.settings import Size, height_and_width
+from renderer.settings import Size, as_size, height_and_width
 
 # Default prompt of a zero-shot network, in which {} stands for the name of a class.
 PROMPT = "a photo of a {}"
@@ -142,8 +142,10 @@ def _read_preprocessor(
 
     # Networks of images and texts have a configuration of their vision part.
     of_config = getattr(getattr(config, "vision_config", config), "image_size", None)
-    size: Size = of_config if isinstance(of_config, int) else USUAL_SIZE
-    sizer = FILE if isinstance(of_config, int) else None
+    # A list is (height, width).
+    is_stated = isinstance(of_config, int | list | tuple)
+    size: Size = as_size("size", of_config) if is_stated else USUAL_SIZE
+    sizer = FILE if is_stated else None
     if processor is None:
         return size, *mean_and_std(IMAGENET), False, sizer, None
     # Images of two sizes become images of one size if the processor resizes to a fixed size.

@@ -252,6 +252,7 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
         return _albumentations_class()(self.lights, self.strength, self.p)
 
 
+@torch.compiler.disable  # type: ignore[untyped-decorator, unused-ignore]
 @without_autocast
 def relight_photographs(
     photographs: Tensor | np.ndarray,

@@ -305,7 +305,7 @@ def call_python(name: str) -> tuple[Callable[[Tensor], Tensor], int, Sequence[st
         raise files.name_error(full_name, reason) from error
     # A single string is not a list of names, although Python counts it as a sequence of strings.
     is_list = isinstance(classes, Sequence) and not isinstance(classes, str)
-    has_names = is_list and all(type(item) is str for item in classes)
+    has_names = is_list and all(isinstance(item, str) for item in classes)
     if not (callable(network) and type(size) in (int, tuple, list) and has_names):
         kinds = ", ".join(type(item).__name__ for item in (network, size, classes))
         advice = "return (torch.nn.Module, pixels per side or (height, width), class names)"

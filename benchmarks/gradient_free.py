@@ -40,7 +40,7 @@ class Outcome:
 
     def cell(self) -> str:
         """Write the successes and the median lead."""
-        return f"{int(self.success.sum())} of {len(self.success)}, {self.lead.median():+.2f}"
+        return f"{int(self.success.sum())} of {len(self.success)}, {self.lead.quantile(0.5):+.2f}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -69,7 +69,7 @@ MITSUBA_ROWS = 512
 # patches of the surface, and trace so many rays per patch.
 CONVERGED_RAYS = 2**14
 CONVERGED_PATCHES = 2**13
-CONVERGED_RAYS_PER_PATCH = 2**8
+CONVERGED_RAYS_PER_PATCH = 2**11
 
 
 @dataclass(frozen=True)

@@ -314,6 +314,12 @@ def plain_weights(state: Mapping[str, Any]) -> dict[str, Tensor]:
     return {name.removeprefix("network."): value for name, value in weights.items()}
 
 
+def as_published(value: Tensor) -> Tensor:
+    """Convert a weight to half precision, unless it is too large for that."""
+    half = value.half().contiguous()
+    return half if value.is_floating_point() and half.isfinite().all() else value
+
+
 def write_published(path: Path, state: Mapping[str, Any]) -> None:
     """Write the network of a checkpoint in half precision, as a file for other users.
 
@@ -322,10 +328,7 @@ def write_published(path: Path, state: Mapping[str, Any]) -> None:
     # The weights of a recognizer are a tensor.
     as_json = partial(json.dumps, ensure_ascii=False, default=Tensor.tolist)
     metadata = {key: as_json(state[key]) for key in PUBLISHED_FACTS if key in state}
-    weights = {
-        name: value.half().contiguous() if value.is_floating_point() else value
-        for name, value in state["model"].items()
-    }
+    weights = {name: as_published(value) for name, value in state["model"].items()}
     atomic_write(path, safetensors.torch.save(weights, metadata), durable=True)
 
 

@@ -421,11 +421,12 @@ class RenderSettings(TaskSettings):
             raise self.wrong("shard", f"must be less than shards={self.shards}")
         if self.splits is None:
             self.splits = {"train": 0.8, "val": 0.1, "test": 0.1}
+        elif isinstance(self.splits, dict):
+            self.splits = {str(part): fraction for part, fraction in self.splits.items()}
         parts = [*self.splits.values()] if isinstance(self.splits, dict) else []
         if not all(is_number(part) and part >= 0 for part in parts) or not sum(parts):
             raise self.wrong("splits", "must be parts and their fractions, such as {train: 1}")
-        names = map(str, self.splits)
-        if any(name in ("", "..") or Path(name).name != name for name in names):
+        if any(name in ("", "..") or Path(name).name != name for name in self.splits):
             raise self.wrong("splits", "must name parts without folders, such as {train: 1}")
         common.prepare_attack(self, self.augment.attack.parameters)
         # The default depends on the network. `require_counting` refuses other modes.

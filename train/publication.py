@@ -8,7 +8,7 @@ from typing import Any
 from augment.classifier import Classifier, OperatingPoint, TaskNetwork
 from augment.settings import PYTHON
 from renderer.errors import InputError, as_path, require_choice
-from train.checkpoints import load_run, load_selected, write_published
+from train.checkpoints import as_published, load_run, load_selected, write_published
 from train.command_settings import require_calibration
 from train.results.metrics import METRICS, Metrics
 from train.results.overwrite import require_replaceable
@@ -179,7 +179,8 @@ def publish(
             if not labels:
                 raise InputError(f"label is not set, nor in run={run}: give label", "label")
             # Published weights have 16 bits.
-            loaded.half().float()
+            for weight in loaded.state_dict().values():
+                weight.copy_(as_published(weight))
             predictor = Predictor(loaded, loaded.classes, loaded.size)
             negatives = as_path("calibrate", calibrate)
             points = choose_operating_points(predictor, negatives, labels, false_positive_rate)

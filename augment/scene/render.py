@@ -497,7 +497,7 @@ class DirectRenderer:
             vertices=self.vertices[object_index] if moved is None else moved,
             albedo=albedo,
             light=split,
-            is_moved=moved is not None,
+            is_moved=moved is not None or camera is not fixed_camera,
             gloss=gloss,
             lamp_view=lamp_view,
             indirect=indirect if settings.global_illumination else None,

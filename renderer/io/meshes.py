@@ -277,7 +277,7 @@ class _Tree(dict[str, Any]):
 
 def _add_material(tree: _Tree, mesh: Mesh, texture_id: int, gloss: list[float]) -> int:
     """Add a material with a texture (-1: none) and gloss (empty: matte), and return its index."""
-    roughness, metallic, *specular_factors = gloss or (1.0, 0.0)
+    roughness, metallic, *specular_factors = gloss or (1.0, 0.0, 0.0)
     model: dict[str, Any] = {"roughnessFactor": roughness, "metallicFactor": metallic}
     if texture_id >= 0:
         model["baseColorTexture"] = tree.add_texture(mesh.textures[texture_id])

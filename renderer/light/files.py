@@ -44,11 +44,12 @@ def save_light(
 ) -> float:
     """Write a light to a .json file, or environment lighting as a map for other software.
 
-    From a .json file, `load_light` reads exactly the same float32 numbers. For a
-    projector, its pattern is also written to an 8-bit .png file with the same
-    name. White in this image is the largest coefficient, the attribute `power` of
-    the projector. A map (.hdr, .exr or .npy) has no negative radiance and the same
-    mean, so its irradiance can differ from that of the light.
+    From a .json file of spherical harmonics, `load_light` reads exactly the same
+    float32 numbers. `LampsSettings.start` takes that of lamps. For a projector, its
+    pattern is also written to an 8-bit .png file with the same name. White in this
+    image is the largest coefficient, the attribute `power` of the projector. A map
+    (.hdr, .exr or .npy) has no negative radiance and the same mean, so its
+    irradiance can differ from that of the light.
 
     Args:
         path: Path of a .json file or, for spherical harmonics, of a map. Its folder

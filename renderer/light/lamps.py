@@ -156,7 +156,11 @@ class Projector(Settings, LocalBasis):
         if points.requires_grad and self.pixels > 1:
             _, _, places = self._seen(points[paths.point])
             pattern = light.detach().view(self.pixels, self.pixels, -1)
-            for place, slope in zip(places, torch.gradient(pattern, dim=(0, 1)), strict=True):
+            rows, columns = torch.gradient(pattern, dim=(0, 1))
+            # A step between two pixels counts half in each.
+            rows[[0, -1]] /= 2
+            columns[:, [0, -1]] /= 2
+            for place, slope in zip(places, (rows, columns), strict=True):
                 moved = place - place.detach()
                 arriving = arriving + slope.flatten(0, 1)[paths.function] * moved[:, None]
         return arriving
