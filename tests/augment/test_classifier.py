@@ -374,9 +374,30 @@ def test_onnx_gives_the_scores_of_its_graph_and_a_size_that_it_tells_is_not_assu
         classifier = nb.load_classifier(path)
         images = torch.rand(4, 3, classifier.size, classifier.size)
         torch.testing.assert_close(classifier(images), images.mean((2, 3)), rtol=1e-5, atol=1e-6)
-    fixed, free = said()
+    assert nb.load_classifier(path, size=(48, 64)).size == (48, 64)
+    fixed, free, given = said()
     assert "64 × 64 pixels, stated by the file; not normalized, assumed" in fixed
     assert "224 × 224 pixels, assumed; not normalized, assumed" in free
+    assert "48 × 64 pixels, stated by you" in given
+
+
+def test_onnx_with_free_sides_that_needs_one_size_is_read_at_the_given_size(tmp_path):
+    import onnx
+
+    path = save_onnx(tmp_path / "network.onnx", shape=("height", "width"))
+    model = onnx.load(path)
+    # Only images of 3 × 64 × 64 values have two rows of this length.
+    shape = onnx.helper.make_tensor("shape", onnx.TensorProto.INT64, [2], [2, 3 * 64 * 64])
+    model.graph.initializer.append(shape)
+    model.graph.node.append(onnx.helper.make_node("Reshape", ["images", "shape"], ["rows"]))
+    onnx.save(model, path)
+    assert nb.load_classifier(path, size=64).size == 64
+
+
+def test_names_of_classes_may_be_texts_of_numpy(tmp_path):
+    names = list(np.array(["a", "b", "c"]))
+    classifier = nb.load_classifier(save_onnx(tmp_path / "network.onnx"), classes=names)
+    assert [type(name) for name in classifier.classes] == [str] * 3
 
 
 @pytest.mark.parametrize("kind", ["FLOAT16", "DOUBLE"])

@@ -65,6 +65,17 @@ def test_an_operating_point_is_above_the_second_lowest_log_odds_and_stays(
     assert summary["operating_point"] == vars(point) | {"in_sample": True}
 
 
+def test_a_weight_that_half_precision_cannot_hold_is_published_in_full(finished, tmp_path):
+    run = copytree(finished, tmp_path / "run")
+    state = checkpoints.load(run / run_folder.BEST)
+    name = next(name for name in state["model"] if name.endswith("running_var"))
+    state["model"][name][0] = 105_932.0
+    checkpoints.save(run / run_folder.BEST, state)
+    nb.publish(run, tmp_path / "out")
+    published = load_run(tmp_path / "out").state_dict()
+    assert 105_932.0 in [float(value.max()) for value in published.values()]
+
+
 LABELS = ("orange", "apple")
 PRETRAINED = ["none", "random", "adversarial", "best"]
 

@@ -457,3 +457,19 @@ def images_of_moved(scene, mesh, vertices, lights) -> torch.Tensor:
         gray = GRAYS[row % len(GRAYS)]  # The backgrounds take turns, then the cameras.
         images.append(operator.image(lights[row], gray))
     return torch.stack(images)
+
+
+def test_cameras_alone_have_the_gradient_that_they_have_beside_vertices():
+    scene = build_scene(
+        [("solid:pear", "pear")], 16, rasterizer="numpy", silhouettes=True, fov=40.0
+    )
+    examples = torch.arange(1)
+    weights = torch.linspace(0, 1, 16)
+    gradients = []
+    for change in ({}, {"vertices": scene.vertices}):
+        move = torch.zeros(1, 3, requires_grad=True)
+        conditions = replace(scene.conditions(examples), cameras=move, **change)
+        images = scene.render(conditions, examples)
+        gradients += torch.autograd.grad((images * weights).sum(), move)
+    assert gradients[0].abs().min() > 0
+    assert torch.equal(*gradients)

@@ -198,6 +198,12 @@ def test_a_glb_gives_back_the_gloss_if_it_is_asked_for(tmp_path, textures):
             assert_array_equal(gloss_texture, mesh.gloss_textures[texture_id])
 
 
+def test_a_matte_mesh_reflects_nothing_in_the_file(tmp_path):
+    """A dielectric of glTF reflects 4%, unless its specular factor is 0."""
+    export_mesh(box(), tmp_path / "mesh.glb")
+    assert load_mesh(tmp_path / "mesh.glb", gloss=True).gloss[:, 1:].max() == 0
+
+
 def test_gltfs_gloss_has_its_defaults_and_a_texture_without_color(tmp_path):
     """A material without factors is a rough metal. Green is roughness, and blue is metallic."""
     texels = np.arange(12, dtype=np.uint8).reshape(2, 2, 3)

@@ -17,7 +17,7 @@ import renderer
 from renderer.camera import Camera, OrthographicCamera, PerspectiveCamera
 from renderer.light.files import ambient, load_light
 from renderer.light.lamps import Lamps, Projector
-from renderer.mesh import concatenate
+from renderer.mesh import Mesh, concatenate
 from renderer.pinhole import PinholeCamera
 from renderer.solids import SOLIDS
 
@@ -123,6 +123,23 @@ def test_the_pattern_of_a_projector_stays_in_place_while_an_object_moves_through
 
     directions = displacements(points)
     require_differences(image, directions, 6, 16, step=0.02, bound=0.03)
+
+
+@pytest.mark.parametrize("pixels", [2, 3, 8])
+def test_a_plane_that_slides_in_itself_under_a_projector_shows_the_same_pattern(pixels):
+    """The pattern rises from row to row, and is as wide as the image."""
+    corners = np.array([[-3.0, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0]])
+    plane = Mesh.plain(corners, np.array([[0, 1, 2], [0, 2, 3]]), (0.8,) * 3)
+    beamer = Projector(pixels=pixels, polar=0.0, azimuth=0.0, fov=22.63)
+    ramp = torch.linspace(0.2, 0.8, pixels).double()[:, None, None].expand(-1, pixels, 3)
+    shift = torch.zeros(3, dtype=torch.float64, requires_grad=True)
+    options = {"lights": [(beamer, ramp.flatten(0, 1))], "silhouettes": True}
+    vertices = torch.from_numpy(corners) + shift
+    camera = OrthographicCamera(0, 0, 1.6)
+    image = renderer.render(plane, camera, None, 32, 0.0, vertices=vertices, samples=8, **options)
+    weights = torch.linspace(0, 2, 32).double()[:, None]
+    (gradient,) = torch.autograd.grad((image * weights).mean(), shift)
+    assert gradient[:2].abs().max() < 1e-3
 
 
 # Walls of the cup and of the plate are a few samples thick.

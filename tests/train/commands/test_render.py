@@ -334,6 +334,10 @@ def test_the_parts_of_the_command_line_replace_those_of_the_default():
     assert main.read(["out=out", "splits={train: 1}"]).splits == {"train": 1}
 
 
+def test_parts_may_be_numbered():
+    assert main.read(["out=out", "splits={0: 1, 1: 2}"]).splits == {"0": 1, "1": 2}
+
+
 @pytest.mark.parametrize("name", ["../photos", "a/b", ".."])
 def test_a_part_cannot_be_in_another_folder(name):
     with pytest.raises(InputError, match="splits"):
