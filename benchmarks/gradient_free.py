@@ -9,8 +9,10 @@ Markdown table.
 """
 
 import argparse
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import median
 
 import torch
 from torch import Tensor
@@ -40,7 +42,9 @@ class Outcome:
 
     def cell(self) -> str:
         """Write the successes and the median lead."""
-        return f"{int(self.success.sum())} of {len(self.success)}, {self.lead.quantile(0.5):+.2f}"
+        # Without examples, there is no median.
+        lead = median(self.lead.tolist() or [math.nan])
+        return f"{int(self.success.sum())} of {len(self.success)}, {lead:+.2f}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -218,7 +218,7 @@ def test_a_resumed_run_has_its_recorded_threads_unless_given_others(tiny, tmp_pa
     before = torch.get_num_threads()
     try:
         for chosen, threads, expected in ((2, "null", 2), (1, "null", 2), (1, "3", 3)):
-            monkeypatch.setattr("train.device.choose_threads", lambda *_, n=chosen: n)
+            monkeypatch.setattr("train.training.run.choose_threads", lambda *_, n=chosen: n)
             keys = (f"train.threads={threads}", f"train.resume={str(chosen == 1).lower()}")
             settings = tiny(*WITHOUT_RENDERS, "train.images_per_epoch=16", *keys)
             run = loaded_run(settings, tmp_path)
