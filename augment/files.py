@@ -181,11 +181,9 @@ def load_file(name: str, facts: NetworkFacts, trust_code: bool) -> TaskNetwork:
         advice = "set trust=true (trust_code=True in Python) if you trust its author"
         reason = f"is a program, which can run any code and overwrite your files: {advice}"
         raise name_error(path, f"{reason}, otherwise ask for a state dict, safetensors or ONNX")
-    read: Callable[[Path], Content] = _read_torchscript
-    if path.suffix.lower() == EXPORTED:
-        read = _read_exported
-    elif path.suffix.lower() == ONNX:
-        read = partial(_read_onnx, size=facts.size)
+    readers: dict[str, Callable[[Path], Content]] = {EXPORTED: _read_exported}
+    readers[ONNX] = partial(_read_onnx, size=facts.size)
+    read = readers.get(path.suffix.lower(), _read_torchscript)
     advice = "give a file of TorchScript, torch.export (.pt2) or ONNX (.onnx)"
     with reading_network(path, "cannot be read", advice):
         # The sizes are those of the four dimensions of images. None stands for any size.
@@ -361,10 +359,10 @@ class InBatches(Network):
         return tuple(joined) if isinstance(joined, list) else joined
 
 
-def _read_onnx(path: Path, size: Size | None = None) -> Content:
+def _read_onnx(path: Path, size: Size | None) -> Content:
     """Read a file of ONNX, with gradients if onnx2torch is installed and converts it exactly."""
     network, sizes, is_last = read_onnx(path)
-    # Dimensions without a size get a default: two images of the user's size, or of 224 pixels.
+    # Free dimensions become those of two images of the user's size, or else of 224 pixels.
     defaults = (2, 3, *height_and_width(size or classifiers.USUAL_SIZE))
     shape = [fixed or default for fixed, default in zip(sizes, defaults, strict=True)]
     images = torch.rand(shape, generator=torch.Generator().manual_seed(0))

@@ -477,9 +477,10 @@ def load_networks(options: argparse.Namespace) -> dict[str, list[Classifier]]:
             networks[f"{title} × {factor:g}"] = between
     if options.control not in (None, *networks):
         raise SystemExit(f"--control {options.control} is none of {', '.join(networks)}")
-    seeds = len(networks[options.control or first])
-    if seeds > 1 and any(len(others) not in (1, seeds) for others in networks.values()):
-        raise SystemExit(f"--control {options.control} needs as many seeds as the other networks")
+    control = options.control or first
+    count = len(networks[control])
+    if count > 1 and any(len(others) not in (1, count) for others in networks.values()):
+        raise SystemExit(f"the control {control} needs as many seeds as the other networks")
     return networks
 
 

@@ -10,7 +10,7 @@ The renderers differ in these ways:
   Mitsuba, and the irradiance times the albedo in our renderer. The lights for
   Mitsuba are therefore multiplied by π. Without bounces and gloss, they are also
   multiplied by the albedo scale. With bounces, the colors of the materials are,
-  because the albedo scale applies again at each bounce. So they are with gloss,
+  because the albedo scale applies again at each bounce. With gloss, they are, too,
   because specular reflection does not have the albedo.
 - Mitsuba always has shadows. If our render has none, a concave mesh is darker in
   Mitsuba.

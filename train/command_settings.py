@@ -383,9 +383,7 @@ class RenderSettings(TaskSettings):
         list(DATA_SET_MAPS), "Further images of each render.", choices=DATA_SET_MAPS
     )
     seed: int = setting(0, "Seed of all random draws.", within=(0, MAX_SEED))
-    shards: int = setting(
-        1, "Parts of the work that --multirun shard=0,1,... shares.", within=(1, None)
-    )
+    shards: int = setting(1, "Parts of the work for --multirun shard=0,1,...", within=(1, None))
     shard: int = setting(0, "Index of the part that this process renders.", within=(0, None))
     out: str = setting(REQUIRED, "Folder of the data set. A stopped command continues in it.")
     augment: augmentation.AugmentationSettings = setting(

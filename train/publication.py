@@ -178,7 +178,7 @@ def publish(
             labels: Any = label if label is not None else trained_labels(folder)
             if not labels:
                 raise InputError(f"label is not set, nor in run={run}: give label", "label")
-            # Published weights have 16 bits.
+            # Published weights have 16 bits, unless these cannot hold them.
             for weight in loaded.state_dict().values():
                 weight.copy_(as_published(weight))
             predictor = Predictor(loaded, loaded.classes, loaded.size)

@@ -27,7 +27,7 @@ from renderer.errors import InputError
 from renderer.io.files import atomic_write
 from train.run_folder import opened_text
 from train.settings import CIRCUMSTANCES, ExperimentSettings, dotted, published_folder
-from train.system import program
+from train.system import YAML_LOADER, program
 
 CONFIG = "config.yaml"
 # Arguments that are left out when the command line of a run is recorded. Whoever
@@ -54,12 +54,10 @@ def read_config(path: Path) -> DictConfig:
     """
     # `opened_text` turns any error in its block into an InputError that names the file.
     with opened_text(path) as text:
-        # The loader of libyaml is ten times as fast, where it is installed.
-        loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-        events = yaml.parse(text, loader)
+        events = yaml.parse(text, YAML_LOADER)
         if "${" in text or any(isinstance(event, yaml.AliasEvent) for event in events):
             raise ValueError("it holds an alias or an interpolation")
-        plain = yaml.load(text, loader)
+        plain = yaml.load(text, YAML_LOADER)
         if not isinstance(plain, dict):
             raise ValueError("it holds no keys")
         return OmegaConf.create(plain)

@@ -285,15 +285,16 @@ class Objective:
         # Noise is tested only in examples with a view that is fooled without noise.
         tested = torch.nonzero(is_fooled.any(1)).squeeze(1)
         noise = self.settings.sensor_noise
-        if noise and len(tested):
-            criterion = self.criterion.select(tested)
-            shown = images[tested.to(images.device)]
-            keys = examples.to(tested.device)[tested]
-            for noisy_images in add_sensor_noise(shown, noise, keys, self.seed, "sensor noise"):
-                evidence = self.select(tested).evidence(noisy_images)
-                noisy_predicted = criterion.predicted(evidence).to(is_fooled.device)
-                # A view must be fooled in every draw of the noise.
-                is_fooled[tested] &= criterion.reached_in_views(noisy_predicted)
+        if not noise or not len(tested):
+            return is_fooled
+        criterion = self.criterion.select(tested)
+        shown = images[tested.to(images.device)]
+        keys = examples.to(tested.device)[tested]
+        for noisy_images in add_sensor_noise(shown, noise, keys, self.seed, "sensor noise"):
+            evidence = self.select(tested).evidence(noisy_images)
+            noisy_predicted = criterion.predicted(evidence).to(is_fooled.device)
+            # A view must be fooled in every draw of the noise.
+            is_fooled[tested] &= criterion.reached_in_views(noisy_predicted)
         return is_fooled
 
 

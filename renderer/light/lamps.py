@@ -153,16 +153,17 @@ class Projector(Settings, LocalBasis):
         The slope of the pattern is that between both neighbors of a pixel.
         """
         arriving = light[paths.function]
-        if points.requires_grad and self.pixels > 1:
-            _, _, places = self._seen(points[paths.point])
-            pattern = light.detach().view(self.pixels, self.pixels, -1)
-            rows, columns = torch.gradient(pattern, dim=(0, 1))
-            # A step between two pixels counts half in each.
-            rows[[0, -1]] /= 2
-            columns[:, [0, -1]] /= 2
-            for place, slope in zip(places, (rows, columns), strict=True):
-                moved = place - place.detach()
-                arriving = arriving + slope.flatten(0, 1)[paths.function] * moved[:, None]
+        if not points.requires_grad or self.pixels == 1:
+            return arriving
+        _, _, places = self._seen(points[paths.point])
+        pattern = light.detach().view(self.pixels, self.pixels, -1)
+        rows, columns = torch.gradient(pattern, dim=(0, 1))
+        # A step between two pixels counts half in each.
+        rows[[0, -1]] /= 2
+        columns[:, [0, -1]] /= 2
+        for place, slope in zip(places, (rows, columns), strict=True):
+            moved = place - place.detach()
+            arriving = arriving + slope.flatten(0, 1)[paths.function] * moved[:, None]
         return arriving
 
     def mitsuba_emitters(self, coefficients: Tensor, albedo_scale: float) -> list[dict[str, Any]]:

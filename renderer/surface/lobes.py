@@ -144,16 +144,17 @@ class ViewFrame(NamedTuple):
         exponents = _sine_exponents(torch.arange(-degree, degree + 1, device=x.device).abs())
         factors = _complex_powers(x / sine, y / sine, degree) * sine_powers[exponents]
         coefficients = lobes.index_select(0, functions) * factors.index_select(0, degree + orders)
+        if self.tilt is None:
+            return coefficients
         # The tilt R_x(a) R_y(b) rotates about the y-axis and then about the x-axis. But
         # harmonics are only easy to rotate about the z-axis. Let C be the cyclic
         # permutation of the axes: x to y, y to z, z to x. Then C R_y(b) = R_z(b) C and
         # C² R_x(a) = R_z(a) C², so R_z(a) C R_z(b) C = C² R_x(a) R_y(b). The loop computes
         # the left side, which is the tilt and then two permutations.
-        if self.tilt is not None:
-            permutation = _axis_permutation(degree)
-            sine_b, cosine_b, sine_a, cosine_a = self.tilt
-            for angle in (Angle(sine_b, cosine_b), Angle(sine_a, cosine_a)):
-                coefficients = _rotate_harmonics(_multiply_bands(permutation, coefficients), angle)
+        permutation = _axis_permutation(degree)
+        sine_b, cosine_b, sine_a, cosine_a = self.tilt
+        for angle in (Angle(sine_b, cosine_b), Angle(sine_a, cosine_a)):
+            coefficients = _rotate_harmonics(_multiply_bands(permutation, coefficients), angle)
         return coefficients
 
     def to_world(self, coefficients: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ A photograph is shown upright, as its EXIF orientation says, and brought to the 
 
 import json
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -275,31 +275,44 @@ def _find_images(file: Path, names: Sequence[str]) -> dict[str, Path]:
     paths = {name: of / name for of in folders for name in names if (of / name).is_file()}
     # Names that no file has exactly may have another form of Unicode: archives of a Mac change it.
     for form in (str, composed):
-        missing = [name for name in names if name not in paths]
-        # Images that no name has found yet, by their names without folder.
-        others: dict[str, list[Path]] = defaultdict(list)
-        used = {*paths.values()}
-        for path in visible_files(folders[0]) if missing else ():
-            if path.suffix.lower() in SUFFIXES and folders[0] / path not in used:
-                others[form(path.name)].append(folders[0] / path)
-        uses = Counter(form(PurePosixPath(name).name) for name in names)
-        for name in missing:
-            parts = PurePosixPath(form(name)).parts
-            # Images of this name, by the number of equal parts at the end of their paths.
-            by_equal_parts: dict[int, list[Path]] = defaultdict(list)
-            for image in others[parts[-1]]:
-                by_equal_parts[_equal_ends(Path(form(str(image))).parts, parts)].append(image)
-            most = max(by_equal_parts, default=0)
-            # An image in another folder may be any of several that have its name.
-            if most == 1 and uses[parts[-1]] > 1:
-                continue
-            images = by_equal_parts[most]
-            if len(images) > 1:
-                listed = " and ".join(map(str, images[:2]))
-                raise InputError(f"{file} names the image {name}, which may be {listed}")
-            if images:
-                paths[name] = images[0]
+        if len(paths) < len(names):
+            paths |= _search_images(file, folders[0], names, paths, form)
     return paths
+
+
+def _search_images(
+    file: Path,
+    folder: Path,
+    names: Sequence[str],
+    paths: Mapping[str, Path],
+    form: Callable[[str], str],
+) -> dict[str, Path]:
+    """Find images anywhere in a folder for the names without a path, compared in one form."""
+    # Images that no name has found yet, by their names without folder.
+    others: dict[str, list[Path]] = defaultdict(list)
+    used = {*paths.values()}
+    for path in visible_files(folder):
+        if path.suffix.lower() in SUFFIXES and folder / path not in used:
+            others[form(path.name)].append(folder / path)
+    uses = Counter(form(PurePosixPath(name).name) for name in names)
+    found = {}
+    for name in [name for name in names if name not in paths]:
+        parts = PurePosixPath(form(name)).parts
+        # Images of this name, by the number of equal parts at the end of their paths.
+        by_equal_parts: dict[int, list[Path]] = defaultdict(list)
+        for image in others[parts[-1]]:
+            by_equal_parts[_equal_ends(Path(form(str(image))).parts, parts)].append(image)
+        most = max(by_equal_parts, default=0)
+        # An image in another folder may be any of several that have its name.
+        if most == 1 and uses[parts[-1]] > 1:
+            continue
+        images = by_equal_parts[most]
+        if len(images) > 1:
+            listed = " and ".join(map(str, images[:2]))
+            raise InputError(f"{file} names the image {name}, which may be {listed}")
+        if images:
+            found[name] = images[0]
+    return found
 
 
 def _equal_ends(*parts: Sequence[str]) -> int:

@@ -10,7 +10,7 @@ threshold on its log-odds. An image above the threshold counts as detected.
 import hashlib
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from functools import cached_property
@@ -65,8 +65,9 @@ class FolderPredictions(ShortRepr):
         labels: Names of the positive classes.
         unreadable: Paths of the photographs that could not be read.
         left_out: Paths of the files whose type is not supported.
-        images_hash: Hash of the labels and the photographs. If it is equal for
-            two networks, their metrics can be compared.
+        hashes: Hashes of the photographs with each label alone, by label, and with all
+            labels, by "". If the last is equal for two networks, their metrics can be
+            compared.
     """
 
     folder: Path
@@ -75,7 +76,7 @@ class FolderPredictions(ShortRepr):
     labels: list[str]
     unreadable: list[str]
     left_out: list[str]
-    images_hash: str
+    hashes: dict[str, str]
 
 
 @dataclass
@@ -108,17 +109,20 @@ class Predictor:
         ranked = rank_classes(photographs, logits, self.classes, labels)
         # Files that are no images.
         left_out = [str(path) for path in folders.unsupported_files(folder)]
-        facts = labels, unreadable, left_out, _hash(folder, photographs, labels)
+        facts = labels, unreadable, left_out, _hashes(folder, photographs, labels)
         return FolderPredictions(folder, ranked, images, *facts)
 
 
-def _hash(folder: Path, photographs: Iterable[Photograph], labels: Sequence[str]) -> str:
-    """Hash the positive classes and the photographs with SHA-256."""
-    digest = hashlib.sha256("\n".join(labels).encode())
+def _hashes(folder: Path, photographs: Sequence[Photograph], labels: list[str]) -> dict[str, str]:
+    """Hash photographs with SHA-256, together with each label alone and, by "", with all labels."""
+    parts = {"": labels} | {label: [label] for label in labels}
+    digests = {key: hashlib.sha256("\n".join(part).encode()) for key, part in parts.items()}
     for photograph in photographs:
-        content = (folder / photograph.path).read_bytes()
-        digest.update(f"{photograph}{photograph.mesh or ''}".encode() + content)
-    return digest.hexdigest()
+        row = f"{photograph}{photograph.mesh or ''}".encode()
+        content = row + (folder / photograph.path).read_bytes()
+        for digest in digests.values():
+            digest.update(content)
+    return {key: digest.hexdigest() for key, digest in digests.items()}
 
 
 def compute_logits(
@@ -268,11 +272,9 @@ class Scores(ShortRepr):
         The value "in_sample" tells whether an operating point was chosen on the
         same images that are scored.
         """
-        shown = self.predicted
-        photographs = shown.predictions.photograph[: len(shown.images)]
+        hashes = self.predicted.hashes
         return [
-            asdict(point)
-            | {"in_sample": point.images == _hash(shown.folder, photographs, [point.label])}
+            asdict(point) | {"in_sample": point.images == hashes.get(point.label)}
             for point in self.points
         ]
 
@@ -286,7 +288,7 @@ class Scores(ShortRepr):
         summary: dict[str, Any] = {
             "label": predicted.labels if has_labels else predicted.labels[0],
             "size": as_size("size", predicted.images.shape[-2:]),
-            "images": predicted.images_hash,
+            "images": predicted.hashes[""],
             **self.overall.to_summary(),
             "n": {
                 "photographs": len(predicted.images),
@@ -380,7 +382,7 @@ def choose_operating_points(
         higher = rows.log_odds[rows.log_odds > threshold]
         if len(higher):
             threshold = (threshold + higher.min()) / 2
-        chosen_on = (folder.resolve().name, _hash(folder, rows.photograph, [name]), count)
+        chosen_on = (folder.resolve().name, predicted.hashes[name], count)
         points.append(OperatingPoint(name, float(threshold), rate, *chosen_on))
     return points
 

@@ -30,6 +30,14 @@ BATCH = 32
 Weights = Mapping[str, Tensor]
 
 
+def weights_on_cpu(network: nn.Module) -> dict[str, Tensor]:
+    """Return a copy of the state dict of a network on the CPU."""
+    state = network.state_dict()
+    # A new dictionary would lose the versions of modules, without which MNASNet cannot be loaded.
+    state.update({name: value.to("cpu", copy=True) for name, value in state.items()})
+    return state
+
+
 class MovingAverage(AveragedModel):
     """Exponential moving average of the parameters and buffers of a model.
 
@@ -111,10 +119,7 @@ class Averages:
 
     def weights(self) -> dict[str, torch.Tensor]:
         """Return a copy of the weights of the selected network on the CPU, by name."""
-        state = self.selected.network.state_dict()
-        # A dictionary of its own would lose the versions of modules, which MNASNet needs.
-        state.update({name: value.to("cpu", copy=True) for name, value in state.items()})
-        return state
+        return weights_on_cpu(self.selected.network)
 
     def state_dict(self) -> dict[str, Any]:
         """Return the states of the moving average and of the soup for a checkpoint."""

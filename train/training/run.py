@@ -33,7 +33,7 @@ from train.run_config import CONFIG, require_same_run, require_same_weights, wri
 from train.run_folder import BEFORE, BEST, WEIGHTS, find_original
 from train.settings import KEPT_ASIDE, LABORATORY, WIDERESNET, ExperimentSettings, in_light
 from train.training import inputs
-from train.training.averages import INTERPOLATION, interpolate, predict
+from train.training.averages import INTERPOLATION, interpolate, predict, weights_on_cpu
 from train.training.loop import Trainer, evaluate
 from train.training.recipe import freeze, scale_learning_rate
 from train.training.recognition import fit_recognizer, recognizing_layers
@@ -250,9 +250,7 @@ class Run:
         path = self.folder / WEIGHTS
         # The weights have the names of the user's own network, without wrappers of this library.
         raw = wrappers.unwrapped(self.trainer.selected.network, own_alone=True)
-        state = raw.state_dict()
-        state.update({name: value.cpu() for name, value in state.items()})
-        checkpoints.save(path, state)
+        checkpoints.save(path, weights_on_cpu(raw))
         console.info("network.load_state_dict(torch.load(%r)) loads the result", str(path))
         # Settings of the wrapper that normalizes the light of images. None without one.
         light = exposure.light_settings(self.trainer.selected.network)
