@@ -263,7 +263,7 @@ def read_auc(folder: Path) -> float:
 
 
 @pytest.mark.slow
-def test_the_demonstration_ends_with_a_table_of_the_effect_an_image_and_a_report(tmp_path):
+def test_the_demonstration_ends_with_a_table_of_the_effect_and_a_report(tmp_path):
     environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(tmp_path)}
     options = {"cwd": tmp_path, "env": environment, "capture_output": True, "text": True}
     done = subprocess.run([sys.executable, "-m", "train"], check=True, **options)
@@ -272,8 +272,6 @@ def test_the_demonstration_ends_with_a_table_of_the_effect_an_image_and_a_report
     assert len(lines) <= 20
     page = Path(lines[-1].removeprefix("report: "))
     folder = page.parent
-    *_, sheet = re.findall(r"^image: (.*)$", (folder / "train.log").read_text(), re.M)
-    assert Path(sheet).read_bytes().startswith(b"\x89PNG")
     before = read_auc(folder / "before")
     after = read_auc(folder)
     assert after > before + 0.05
