@@ -15,6 +15,7 @@ import sys
 import textwrap
 import warnings
 import zipfile
+from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ import numpy as np
 import safetensors.torch
 import torch
 from torch import Tensor, nn
+from torch.nn.modules.batchnorm import _NormBase
 from torch.nn.modules.utils import consume_prefix_in_state_dict_if_present
 from torch.utils._pytree import tree_leaves, tree_map
 
@@ -514,5 +516,16 @@ def fill(classifier: Classifier, state: State, source: str | Path) -> Classifier
     """
     misfit = f"weights={source} do not fit {classifier.name}"
     with explained(misfit, "use weights of that network", "weights"):
-        unwrapped(classifier).load_state_dict(state)
+        load_weights(unwrapped(classifier), state)
     return classifier
+
+
+def load_weights(network: nn.Module, state: State) -> None:
+    """Load weights, which need not have the versions of modules, as those of safetensors."""
+    weights: Any = OrderedDict(state)
+    # MNASNet cannot be loaded without its version. With that of batch normalization, older files
+    # would be refused.
+    modules = network.named_modules()
+    own = {key: {"version": of._version} for key, of in modules if not isinstance(of, _NormBase)}
+    weights._metadata = getattr(state, "_metadata", own)
+    network.load_state_dict(weights)

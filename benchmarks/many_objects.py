@@ -59,6 +59,7 @@ from train.data.photo import TABLE
 from train.laboratory.laboratory import write_laboratory
 from train.results.intervals import Jackknife, Units, average, change, leave_out, weighted_means
 from train.results.tables import Estimate, Table, format_fraction, format_interval, fraction
+from train.training.averages import mix
 
 TEST = "test"
 SAME = "objects trained on"
@@ -440,13 +441,8 @@ def interpolate(original: Classifier, trained: Classifier, factor: float) -> Cla
     Returns:
         Network with the interpolated weights.
     """
-    before = original.state_dict()
-    weights = {}
-    for name, value in trained.state_dict().items():
-        is_number = value.is_floating_point()
-        weights[name] = before[name].lerp(value, factor) if is_number else value
     result = deepcopy(trained)
-    result.load_state_dict(weights)
+    result.load_state_dict(mix(original.state_dict(), trained.state_dict(), factor))
     return result
 
 

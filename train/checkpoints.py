@@ -24,7 +24,7 @@ from torch import Tensor
 
 from augment.classifier import Classifier, OperatingPoint, TaskNetwork
 from augment.exposure import DIM, with_normalized_light
-from augment.files import NetworkFacts, is_network_file, require_no_facts
+from augment.files import NetworkFacts, is_network_file, load_weights, require_no_facts
 from augment.network import FROM_FILE, Inputs, say_inputs, say_once
 from augment.settings import PYTHON, split_function
 from augment.sources import SOURCES, import_function, load_classifier
@@ -247,7 +247,7 @@ def load_run(
         light = shape.pop(NORMALIZE_LIGHT, None)
         built = build_network(classes, size, trust_code=trust_code, **shape)
         network = with_normalized_light(built, light)
-        network.load_state_dict(state["model"])
+        load_weights(network, state["model"])
         facts = network, size, classes, f"{RUN}{run}"
         loaded: Any
         if name == DETECTOR:

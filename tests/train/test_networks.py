@@ -4,10 +4,11 @@ from itertools import product
 from pathlib import Path
 
 import pytest
+import safetensors.torch
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torchvision.models import resnet18
+from torchvision.models import mnasnet0_5, resnet18
 from torchvision.transforms.functional import normalize
 
 from renderer.errors import InputError
@@ -227,6 +228,23 @@ def test_other_networks_are_loaded_by_their_name_and_copied_without_their_code(
     initial = load_initial(settings)
     initial.copy_to(fresh, {"classes": [*CLASSES], "size": 16, "name": name})
     assert torch.equal(fresh.eval()(images), network(images))
+
+
+def test_weights_in_safetensors_need_no_versions_of_modules(tmp_path):
+    """MNASNet has versions, which safetensors does not store."""
+    weights = mnasnet0_5(num_classes=3).state_dict()
+    safetensors.torch.save_file(weights, tmp_path / "a.safetensors")
+    name = {"network": "torchvision:mnasnet0_5", "weights": "a.safetensors"}
+    initial = load_initial(ExperimentSettings(**name, classes=[*CLASSES]))
+    state = {"model": initial.weights, "architecture": initial.architecture}
+    write_published(tmp_path / PUBLISHED, state)
+    network = load_run(tmp_path).network
+    again = load_initial(ExperimentSettings(network=str(tmp_path)))
+    again.copy_to(network, again.architecture)
+    first = next(iter(weights))
+    assert torch.equal(
+        dict(network.state_dict())[f"network.{first}"], weights[first].half().float()
+    )
 
 
 @pytest.mark.parametrize(

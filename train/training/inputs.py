@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from augment import distributed
+from augment import distributed, files
 from augment.classifier import TaskNetwork
 from augment.exposure import light_settings, without_normalized_light
 from augment.files import NetworkFacts, is_network_file, name_from_anywhere, require_no_facts
@@ -101,7 +101,7 @@ class Initial:
             fault = f"network={self.source} takes {own} pixels, but the data has {of_data}"
             raise InputError(f"{fault}: give the same size")
         with checkpoints.checks_architecture(self.source):
-            network.load_state_dict(self.weights)
+            files.load_weights(network, self.weights)
 
 
 def load_initial(settings: ExperimentSettings) -> Initial | None:
