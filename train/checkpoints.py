@@ -316,8 +316,9 @@ def plain_weights(state: Mapping[str, Any]) -> dict[str, Tensor]:
 
 def as_published(value: Tensor) -> Tensor:
     """Convert a weight to half precision, unless it is too large for that."""
-    half = value.half().contiguous()
-    return half if value.is_floating_point() and half.isfinite().all() else value
+    half = value.half()
+    has_range = value.is_floating_point() and half.isfinite().all()
+    return (half if has_range else value).contiguous()
 
 
 def write_published(path: Path, state: Mapping[str, Any]) -> None:
