@@ -144,7 +144,10 @@ def _write_example(
     # An index would be another class of another network.
     names = result.classifier.classes
     label = names[result.classifier.label(adversary.shown.label)]
-    others = [(names[of] if isinstance(of, int) else of, x) for of, x in adversary.shown.others]
+    # An index may be a text that is no name. A label of no class stays.
+    name_of: dict[str | int, str] = {str(index): name for index, name in enumerate(names)}
+    name_of |= {name: name for name in names} | dict(enumerate(names))
+    others = [(name_of.get(of, of), mesh) for of, mesh in adversary.shown.others]
     adversary = replace(adversary, shown=replace(adversary.shown, label=label, others=others))
     light_numbers = write_adversary(adversary, path)
     # The files of an adversary have the light after the attack. Add that before it.

@@ -28,14 +28,15 @@ from tests.helpers import by_channel
 @pytest.mark.parametrize("label", ["orange", 0, "0"])
 def test_an_index_of_a_class_is_that_of_the_attacked_network_everywhere(label, tmp_path):
     first, other = by_channel(16), by_channel(16, ("sky", "orange", "lime"))
-    objects = [("solid:orange", label), ("solid:ball", 1)]
+    # The last label is of no class.
+    objects = [("solid:orange", label), *(("solid:ball", other) for other in (1, "1", 99))]
     scene = augment.build_scene([objects], 16, rasterizer="numpy")
     steps = augment.StepSettings("linf", 0.4, "sign", 0.1)
     settings = augment.AttackSettings(lighting=steps, allow_negative=True, max_steps=4)
     result = augment.attack(first, scene, settings=settings)
     assert augment.transfer(result, [other])[0]["clean_correct"] == [True]
     augment.save(result, tmp_path, verify=())
-    assert reload(tmp_path / "example_000").shown.labels == ["orange", "lime"]
+    assert reload(tmp_path / "example_000").shown.labels == ["orange", "lime", "lime", "99"]
 
 
 def test_files_of_an_earlier_attack_in_the_same_folder_are_gone(attacked, tmp_path):
