@@ -197,7 +197,7 @@ class AttackSettings(ParameterSettings):
         "need no gradients. null: gradient, or random_search if the classifier has no gradients.",
         choices=OPTIMIZERS,
     )
-    max_steps: int = setting(30, "Largest number of steps along the gradient.", within=(0, 10**6))
+    max_steps: int = setting(30, "Largest number of steps along the gradient.", within=(0, 10**9))
     max_queries: int | None = setting(
         None,
         "Largest number of forward passes for each example. All starts have the same share of it. "

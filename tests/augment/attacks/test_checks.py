@@ -60,6 +60,10 @@ def test_checks_count_the_steps_of_all_starts(attacked):
     step = StepSettings(radius=0.1, step_size=0.01)
     found = augment.check(attacked({"lighting": step}, max_steps=2, restarts=2))
     assert [*found["success_by_steps"]] == [6, 18, 60]
+    # Both searches succeed in the first start.
+    large = StepSettings(radius=10.0, step_size=1.0)
+    found = augment.check(attacked({"lighting": large}, max_steps=100, restarts=10**4))
+    assert [*found["success_by_steps"]] == [1_000_100, 3_000_300, 10_001_000]
 
 
 def test_random_search_that_does_as_well_is_a_warning(attacked):
