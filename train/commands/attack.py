@@ -39,7 +39,7 @@ from renderer.visibility import Rasterizer
 from train import console
 from train.auditing.lights import criterion_of
 from train.auditing.relit import MODELED, attack_folder
-from train.checkpoints import load_chosen, load_network
+from train.checkpoints import load_chosen, load_network, with_task
 from train.class_names import class_of_meshes
 from train.command_settings import AttackExperimentSettings, AttackSceneSettings
 from train.device import choose_device, choose_rasterizer
@@ -288,6 +288,8 @@ def load_targets(settings: AttackExperimentSettings, attacked: Classifier) -> di
         name = str(values.get("network"))
         with keyed(name="transfer.networks", weights="transfer.networks: weights"):
             other = load_network(name, values.get("weights"), trust_code=settings.trust)
+        if other.task.name == attacked.task.name:
+            other = with_task(other, settings)
         # Classes are compared by name, because their indices may differ in other classifiers.
         # `label` raises an InputError if the classifier lacks the class.
         for mesh in _labeled(settings, attacked.classes):

@@ -37,7 +37,7 @@ from train import class_names, console, run_folder
 from train.auditing import lights, page, relit
 from train.auditing import network as audited
 from train.auditing.network import CLASSIFIER, HARDENED, IN_WORDS, AuditReport
-from train.checkpoints import hash_weights, load_chosen, load_network
+from train.checkpoints import hash_weights, load_chosen, load_network, with_task
 from train.command_settings import ENVIRONMENTS, AuditSettings, LabSettings
 from train.data.annotations import read_annotations
 from train.data.photo import DESCRIPTION
@@ -202,10 +202,11 @@ def run_audit(settings: AuditSettings, networks: Networks | None = None) -> page
     """
     is_named = networks is None
     device = choose_device(settings.device)
-    loaded = {**networks} if networks else {CLASSIFIER: load_chosen(settings)}
+    loaded: dict[str, Any] = {**networks} if networks else {CLASSIFIER: load_chosen(settings)}
     if is_named and settings.hardened:
         with keyed(name="hardened"):
-            loaded[HARDENED] = load_network(settings.hardened, trust_code=settings.trust)
+            other = load_network(settings.hardened, trust_code=settings.trust)
+            loaded[HARDENED] = with_task(other, settings)
     networks = {key: network.to(device) for key, network in loaded.items()}
     # Without meshes, only photographs are attacked, and there is no plan.
     plan, given = None, settings

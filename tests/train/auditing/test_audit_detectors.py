@@ -16,6 +16,7 @@ from train.auditing import page
 from train.auditing.lights import KINDS, Views, recognize_in_environments, render_in
 from train.auditing.relit import RELIT_FOLDER, read_relit
 from train.command_settings import AuditSettings
+from train.commands import audit
 from train.commands.audit import run_audit
 
 SIZE = 32
@@ -135,3 +136,19 @@ def test_the_miou_on_renders_is_that_of_the_pixels_of_the_class(tmp_path):
     assert miou["value"] == pytest.approx(np.mean(expected))
     assert miou["low"] < miou["value"] < miou["high"]
     assert content["metrics"]["random light"]["n"] == 6
+
+
+def test_the_threshold_holds_for_the_hardened_network_too(monkeypatch, tmp_path):
+    found = []
+
+    def stop(_, networks, __):
+        found.extend(network.task for network in networks.values())
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(audit, "_caveats", stop)
+    detector = "run:pretrained/detector"
+    given = {"network": detector, "hardened": detector, "meshes": ["solid:orange:0"]}
+    settings = AuditSettings(**given, threshold=0.9, iou=0.7, out=str(tmp_path / "out"))
+    with pytest.raises(KeyboardInterrupt):
+        run_audit(settings)
+    assert found == [nb.Detection(threshold=0.9, iou=0.7)] * 2

@@ -14,7 +14,9 @@ import norm_balls as nb
 from augment.classifier import as_network
 from renderer.visibility import choose
 from tests.helpers import find_red
-from train.commands.attack import WITHOUT_NOISE, format_reloaded, write_transfers
+from train.checkpoints import load_chosen
+from train.command_settings import AttackExperimentSettings
+from train.commands.attack import WITHOUT_NOISE, format_reloaded, load_targets, write_transfers
 
 PRETRAINED = Path(__file__).parents[3] / "pretrained"
 SMALL = [
@@ -170,3 +172,12 @@ def test_adversaries_are_shown_to_other_networks_azimuths_and_meshes(run, tmp_pa
     for line in (own, still, same):
         assert line["predicted"] == predicted
         assert line["hits"] == line["n"] == len(predicted)
+
+
+def test_the_threshold_and_the_goal_hold_for_networks_to_which_adversaries_are_shown():
+    detector, classifier = "run:pretrained/detector", "run:pretrained/none"
+    settings = AttackExperimentSettings(network=detector, threshold=0.9, goal="mislabel")
+    settings.transfer.networks = [detector, classifier]
+    shown = load_targets(settings, load_chosen(settings))["classifiers"]
+    assert shown[0].task == nb.Detection(threshold=0.9, goal="mislabel")
+    assert shown[1].task == nb.Classification()
