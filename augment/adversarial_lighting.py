@@ -81,6 +81,7 @@ class AdversarialLighting:
         errors.require_kind("task", task, Task | None, "a task, such as nb.Detection(), or None")
         errors.require_whole("steps", steps, 1)
         if isinstance(model, TaskNetwork):
+            model = model if task is None else model.with_task(task)
             task, classes = model.task, model.classes
         self.model, self.task, self.steps = model, task or Classification(), steps
         if not (classes or isinstance(self.task, Classification)):

@@ -89,8 +89,9 @@ class CheckedNetwork(wrappers.Network):
 
     def forward(self, images: Float[Tensor, "N 3 H W"]) -> Any:
         """Compute the outputs of images in the form of the task, and check them."""
-        # A network of a task inside has asked its own network already.
-        task = None if isinstance(self.network, TaskNetwork | Switch) else self.task
+        # A network of a task inside, and both of a switch, have read their own outputs already.
+        is_read = isinstance(self.network, TaskNetwork | Switch)
+        task = None if is_read else self.task
         # A network may change its images in place, such as the normalization of torchvision.
         images = images.clone()
         try:
@@ -111,8 +112,7 @@ class CheckedNetwork(wrappers.Network):
                     names = ", ".join(sorted(str(each).removeprefix("torch.") for each in found))
                     remedy = f"its weights are {names}, convert it with network.to({wanted})"
             raise InputError(f"{self.title} fails on {given} ({kind}): {remedy}") from error
-        # Both networks of a switch have read their own outputs.
-        if self._read is None or isinstance(self.network, Switch):
+        if self._read is None or is_read:
             return outputs
         return self._read(outputs, images)
 

@@ -5,8 +5,9 @@ from torch import nn
 from torchvision import tv_tensors
 
 import norm_balls as nb
+from augment.classifier import as_network
 from renderer.errors import InputError
-from tests.detectors import BrightBox
+from tests.detectors import BrightBox, RawCells
 
 
 class Mean(nn.Module):
@@ -128,6 +129,22 @@ def test_light_hides_boxes_from_a_detector(images):
     found = seeded(hiding(steps=2, lights="low_light"), images, [target] * 8)
     scores = [[item["scores"] for item in DETECTOR(shown / 255)] for shown in (start, found)]
     assert torch.cat(scores[1]).mean() < torch.cat(scores[0]).mean()
+
+
+def test_a_network_with_a_decode_gets_the_light_of_its_raw_network_and_the_task_that_is_given():
+    images = torch.rand(4, 3, 32, 32, generator=torch.Generator().manual_seed(0))
+    network, classes = RawCells().eval(), ["background", "ball"]
+    low, high = (nb.Detection(threshold, decode=RawCells.decode) for threshold in (0.4, 0.99))
+    loaded = as_network(network, 32, classes, task=low)
+    given = {"lights": "linear"}
+    expected = seeded(nb.AdversarialLighting(network, low, classes=classes, **given), images)
+    for model in (loaded, loaded.with_dim(loaded)):
+        found = seeded(nb.AdversarialLighting(model, **given), images)
+        torch.testing.assert_close(found, expected)
+    # Without an object, the light is the random one.
+    random = seeded(nb.RandomLighting("linear"), images)
+    assert not torch.equal(expected, random)
+    assert torch.equal(seeded(nb.AdversarialLighting(loaded, high, **given), images), random)
 
 
 def test_neither_the_mode_of_gradients_nor_the_bits_of_a_pixel_matter(images):
