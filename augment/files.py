@@ -64,6 +64,8 @@ IN_TRAINING_MODE = (
     "was exported in training mode, in which the logits of an image are random or depend on other "
     "images: call eval() before you export it"
 )
+# Module of the class of outputs of transformers, in a graph of such a file.
+OUTPUT_MODULE = re.compile(rb'"(transformers\.[\w.]+)\.\w+\\"')
 # Part of the names of their compiled members.
 COMPILED = "/aotinductor/"
 # Keys under which training scripts store the weights of a network in a checkpoint.
@@ -256,6 +258,11 @@ class Scripted(Network):
 def _read_exported(path: Path) -> Content:
     """Read a network that `torch.export.save` wrote to a file."""
     _require_plain_members(path)
+    with zipfile.ZipFile(path) as archive:
+        graphs = [archive.read(name) for name in archive.namelist() if name.endswith("/model.json")]
+    # torch knows the outputs of a network of transformers only if their module is imported.
+    for module in {*OUTPUT_MODULE.findall(b"".join(graphs))}:
+        import_package(module.decode(), str(path), '"parametric-norm-balls[hf]"')
     program = torch.export.load(path)
     for node in program.graph.nodes:
         schema = getattr(node.target, "_schema", None)

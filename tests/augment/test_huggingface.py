@@ -4,6 +4,8 @@ import json
 import logging
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,7 @@ import torch
 from PIL import Image
 
 import norm_balls as nb
+from augment.classifier import as_network
 from augment.huggingface import _read_preprocessor
 from augment.network import ChannelNormalization
 from renderer import InputError
@@ -302,3 +305,24 @@ def test_code_of_a_repository_is_not_run_even_if_the_user_would_agree(tmp_path, 
     with pytest.raises(InputError):
         nb.load_classifier(f"hf:{tmp_path}")
     assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize("name", ["detr", "segformer"])
+def test_an_exported_network_is_loaded_in_a_program_that_has_not_imported_its_module(
+    name, save, tmp_path
+):
+    folder = save(WITH_POSITIONS[name])
+    network = getattr(transformers, WITH_POSITIONS[name][0]).from_pretrained(folder).eval()
+    path, found = tmp_path / "network.pt2", tmp_path / "found.pt"
+    images = torch.rand(1, 3, SIZE, SIZE, generator=torch.Generator().manual_seed(0))
+    torch.export.save(torch.export.export(network, (images,)), path)
+    code = f"""
+import torch
+import norm_balls as nb
+network = nb.load_classifier({str(path)!r}, classes={CLASSES}, trust_code=True)
+images = torch.rand(1, 3, {SIZE}, {SIZE}, generator=torch.Generator().manual_seed(0))
+torch.save(network(images)[0], {str(found)!r})
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(nb.__file__).parents[1])
+    expected = as_network(network, SIZE, CLASSES)(images)[0]
+    torch.testing.assert_close(torch.load(found), expected)
