@@ -36,7 +36,7 @@ from augment import classifier as classifiers
 from augment import network as wrappers
 from augment.classifier import Classifier, TaskNetwork
 from augment.network import FILE, YOU, Inputs, Network, say_once, unwrapped
-from augment.tasks.task import Task
+from augment.tasks.task import Task, tensors_of
 from renderer.errors import InputError, explained, reading, require_file, require_kind, single_line
 from renderer.settings import MAX_SIZE, Size, as_size, height_and_width
 
@@ -363,7 +363,15 @@ class InBatches(Network):
         last_count = (len(shown) - 1) % self.most + 1
         missing_count = max(0, self.least - last_count)
         filled = torch.cat([shown, shown[:1].expand(missing_count, -1, -1, -1)])
-        parts = [self.network(part) for part in filled.split(self.most)]
+        batches = filled.split(self.most)
+        parts = [self.network(batch) for batch in batches]
+        for batch, part in zip(batches, parts, strict=True):
+            # A file that suppresses boxes itself has a row for each box that is left.
+            wrong = [leaf for leaf in tensors_of(part) if leaf.shape[:1] != batch.shape[:1]]
+            if wrong:
+                returned = f"{tuple(wrong[0].shape)} for a batch of {len(batch)}"
+                advice = "export it without suppression of boxes, or write a python: function"
+                raise InputError(f"the file returned {returned}, not one row per image: {advice}")
         joined = tree_map(lambda *of: torch.cat(of)[: len(images)], *parts)
         return tuple(joined) if isinstance(joined, list) else joined
 

@@ -14,6 +14,7 @@ from torchvision.models import mnasnet0_5
 
 from augment.files import NetworkFacts, read_weights
 from augment.sources import load_classifier
+from augment.tasks.detection import Detection
 from renderer.errors import InputError
 
 SIZE = 8
@@ -81,6 +82,16 @@ def test_an_exported_network_of_one_image_may_return_a_structure(tmp_path, struc
     classifier = load_classifier(str(path), size=SIZE, trust_code=True)
     images = torch.rand(3, 3, SIZE, SIZE)
     torch.testing.assert_close(classifier(images), small_network()(images))
+
+
+@pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
+def test_a_file_of_one_image_whose_outputs_are_not_those_of_each_image_is_refused(tmp_path):
+    """It could return the boxes of one image, which cannot be told from those of the next."""
+    rows = Structured(lambda x: (x.repeat(5, 2)[:, :4], x.flatten().repeat(2)[:5])).eval()
+    path = str(save_exported(rows, tmp_path))
+    task = Detection(decode=lambda raw: [{"boxes": raw[0], "scores": raw[1][:, None]}])
+    with pytest.raises(InputError, match=r"\(5, 4\) for a batch of 1.*without suppression"):
+        load_classifier(path, classes=["a"], size=SIZE, trust_code=True, task=task)
 
 
 @pytest.mark.filterwarnings("ignore")
