@@ -128,28 +128,31 @@ def choose_precision(precision: str, device: torch.device, trained: nn.Module | 
 class MixedPrecision(Network):
     """Network that computes in a chosen precision.
 
-    Images and logits are float32. Between them, torch.autocast uses the chosen precision.
+    Images and logits are float32. Between them, torch.autocast uses the chosen precision. Of a
+    detector, all outputs are returned, and not only logits.
     """
 
-    def __init__(self, network: nn.Module, precision: str):
+    def __init__(self, network: nn.Module, precision: str, is_detector: bool = False):
         super().__init__(network)
-        self.precision = precision
+        self.precision, self.is_detector = precision, is_detector
 
     def forward(self, images: Tensor, *targets: Any) -> Any:
         """Compute outputs or, if a detector gets targets in training mode, its losses."""
         images = images.contiguous(memory_format=torch.channels_last)
         dtype = PRECISIONS[self.precision]
         with torch.autocast(images.device.type, dtype, enabled=dtype != torch.float32):
-            outputs = plain_outputs(self.network(images, *targets))
+            outputs = self.network(images, *targets)
+        outputs = outputs if self.is_detector else plain_outputs(outputs)
         return outputs.float() if isinstance(outputs, Tensor) else outputs
 
 
-def place(network: nn.Module, settings: TrainSettings) -> MixedPrecision:
+def place(network: nn.Module, settings: TrainSettings, is_detector: bool) -> MixedPrecision:
     """Move a network to the device that trains it, and set the precision."""
     set_deterministic(settings.deterministic)
     device = choose_device(settings.device)
     precision = choose_precision(settings.precision, device, network)
-    return MixedPrecision(network.to(device).to(memory_format=torch.channels_last), precision)
+    placed = network.to(device).to(memory_format=torch.channels_last)
+    return MixedPrecision(placed, precision, is_detector)
 
 
 @functools.cache

@@ -16,6 +16,7 @@ from augment import network as wrappers
 from augment.random_streams import stream_seed
 from augment.switch import LIT_NAME
 from augment.tasks.classification import Classification
+from augment.tasks.detection import Detection
 from renderer.errors import InputError, keyed, keys_of
 from renderer.image import to_unit
 from renderer.io.files import remove
@@ -163,7 +164,8 @@ class Run:
         if recipe.freeze:
             with keyed(stage="train.freeze"):
                 freeze(wrappers.unwrapped(network), recipe.freeze, data.size)
-        model = place(wrapped, recipe)
+        task = initial.task if initial else Classification()
+        model = place(wrapped, recipe, isinstance(task, Detection))
         torch.set_num_threads(threads or choose_threads(model, recipe.batch_size, data.size))
         device = wrappers.device_of(model)
         # By default, pretrained classifiers keep the statistics of their normalizations.
@@ -175,7 +177,6 @@ class Run:
             recipe = replace(recipe, learning_rate=rate)
         # The checkpoint describes the network without the wrapper, and the wrapper by its settings.
         description = describe(network, **facts, validation=validation)
-        task = initial.task if initial else Classification()
         service = inputs.build_service(settings, data, device, task)
         options = description, service, self.folder, data.labeled, initial is not None
         return Trainer(recipe, model, *options)

@@ -169,6 +169,22 @@ def test_a_raw_network_keeps_its_candidates_in_low_light(photographs):
     assert changes[1] < 0.9 * changes[0]
 
 
+class OfTwoOutputs(RawCells):
+    """The same network, whose logits are the second of its outputs, as those of ONNX can be."""
+
+    def forward(self, images: Tensor) -> tuple[Tensor, Tensor]:
+        return images, super().forward(images)
+
+
+def test_all_outputs_of_a_raw_network_are_decoded_in_its_training(photographs):
+    hardened = harden(RawCells().eval(), photographs, (), **RAW)
+    task = Detection(decode=lambda outputs: RawCells.decode(outputs[1]))
+    found = harden(OfTwoOutputs().eval(), photographs, (), **RAW | {"task": task})
+    for name, weight in found.state_dict().items():
+        assert torch.equal(weight, hardened.state_dict()[name])
+    assert not torch.equal(found.layer.weight, RawCells().layer.weight)
+
+
 def test_the_loss_of_candidates_is_the_divergence_of_scores_and_the_overlap_of_boxes():
     boxes = torch.tensor([[0.0, 0.0, 2.0, 2.0], [4.0, 4.0, 6.0, 8.0]])
     moved = torch.tensor([[1.0, 0.0, 3.0, 2.0], [4.0, 4.0, 6.0, 8.0]])
