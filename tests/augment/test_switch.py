@@ -135,3 +135,10 @@ def test_networks_of_other_images_or_classes_are_an_error(size, names, said):
     other = nb.Classifier(Constant(0.0, "tensor").eval(), size, names)
     with pytest.raises(InputError, match=f"another {said} than"):
         plain.with_dim(other)
+
+
+@pytest.mark.parametrize("name", ["none", "detector"])
+def test_two_networks_are_not_hardened_at_once(name):
+    network = nb.load(name)
+    with pytest.raises(InputError, match="train one of them"):
+        nb.harden(network.with_dim(network), ["solid:orange"], "pretrained/laboratory")

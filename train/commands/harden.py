@@ -14,7 +14,7 @@ from augment.augmentation_settings import AugmentationSettings
 from augment.classifier import UNIT_RANGE, Classifier, Normalization, TaskNetwork, as_network
 from augment.network import device_of, keep_text_vectors, unwrapped
 from augment.settings import NormalizeLight, RendererSettings
-from augment.switch import Recognizer
+from augment.switch import Recognizer, Switch
 from augment.tasks.classification import Classification
 from augment.tasks.detection import Detection
 from augment.tasks.task import Task
@@ -157,6 +157,8 @@ def harden(
     with folder_or_temporary(out) as folder:
         trainable = _trainable_copy(network)
         classifier = as_network(trainable, *options, normalize_light=normalize_light, task=task)
+        if isinstance(classifier.network, Switch):
+            raise InputError("network has two networks: train one of them")
         is_detector = isinstance(classifier.task, Detection)
         if not (is_detector or isinstance(classifier.task, Classification)):
             raise InputError(f"network is for {classifier.task.name}: give another")
