@@ -20,8 +20,8 @@ from augment.scene.lights import LightModel
 from augment.settings import NO_CLASS_PIXEL
 from augment.tasks.classification import Classification
 from augment.tasks.detection import Detection
-from augment.tasks.segmentation import BACKGROUND, Segmentation
-from augment.tasks.task import NO_GRADIENT, Criterion, Task
+from augment.tasks.segmentation import Segmentation
+from augment.tasks.task import BACKGROUND, NO_GRADIENT, Criterion, Task
 from renderer import errors
 from renderer.errors import InputError
 from renderer.image import require_unit_range

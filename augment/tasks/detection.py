@@ -20,7 +20,15 @@ from torch import Tensor
 
 from augment.network import unwrapped
 from augment.scene.truth import Truth
-from augment.tasks.task import NO_CLASS, GetTruth, ObjectCriterion, Task, stored_names, unique_names
+from augment.tasks.task import (
+    NO_CLASS,
+    GetTruth,
+    ObjectCriterion,
+    Task,
+    are_background,
+    stored_names,
+    unique_names,
+)
 from renderer import errors
 from renderer.errors import InputError
 from renderer.image import to_bytes, to_unit
@@ -193,13 +201,14 @@ class Detection(Task):
     def as_found(
         self, outputs: list[Detections], classes: Sequence[str]
     ) -> tuple[Int[Tensor, " E"], DetectionCriterion]:
-        """Return the criterion of an attack on each box whose score reaches the threshold."""
+        """Return the criterion of an attack on each sure box, except those of a background."""
         # The boxes of all images in one list, and the index of the image of each box.
         boxes, scores, labels = (torch.cat([item[key] for item in outputs]) for key in FINAL)
         image = torch.repeat_interleave(torch.tensor([len(item["scores"]) for item in outputs]))
         options: dict[str, Any] = {"task": self, "class_count": len(classes)}
         criterion = DetectionCriterion(labels[:, None], boxes=boxes[:, None], **options)
-        is_found = scores >= self.threshold
+        is_background = torch.tensor(are_background(classes), device=labels.device)
+        is_found = (scores >= self.threshold) & ~is_background[labels]
         image, criterion = image[is_found.cpu()], criterion.select(is_found)
         # Each example has one view, so its single image can be judged without the axis of views.
         flat = criterion.map(lambda rows: rows[:, 0])

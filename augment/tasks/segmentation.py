@@ -19,11 +19,11 @@ from torch import Tensor
 from augment.network import plain_outputs, unwrapped
 from augment.scene.truth import Truth
 from augment.tasks.detection import log_odds_of
-from augment.tasks.task import GetTruth, ObjectCriterion, Reader, Task, stored_names
+from augment.tasks.task import GetTruth, ObjectCriterion, Reader, Task, are_background, stored_names
 from renderer.errors import InputError, describe, require_number
 
-# Class of the pixels that show no object, and the least fraction of an image that shows one.
-BACKGROUND, LEAST_AREA = "background", 0.01
+# Least fraction of an image that shows an object.
+LEAST_AREA = 0.01
 # Opacity of the colors that are drawn over an image.
 OPACITY = 0.5
 
@@ -115,7 +115,7 @@ class Segmentation(Task):
         """
         label = outputs.argmax(1)
         area = F.one_hot(label, outputs.shape[1]).float().mean((1, 2))
-        area[:, [name.strip("_").lower() == BACKGROUND for name in classes]] = 0
+        area[:, are_background(classes)] = 0
         # One example for each pair of an image and a class that it shows.
         image, source = (area >= LEAST_AREA).nonzero(as_tuple=True)
         masks = label[image] == source[:, None, None]

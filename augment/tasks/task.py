@@ -22,6 +22,8 @@ from renderer.errors import InputError, require
 # Index that stands for "no class" in attacks without a source or a target class. It differs from
 # all labels.
 NO_CLASS = -(10**9)
+# Name of a class that is no object.
+BACKGROUND = "background"
 # What is predicted if no class is found.
 NOTHING = "nothing"
 # What errors say of a network whose outputs do not depend on the images for autograd.
@@ -250,6 +252,11 @@ def gradient_of(values: Tensor, images: Tensor, weights: Tensor | None = None) -
 def unique_names(names: Sequence[str]) -> list[str]:
     """Add its index to each name that occurs twice, because labels are found by name."""
     return [f"{name} {i}" if names.count(name) > 1 else name for i, name in enumerate(names)]
+
+
+def are_background(classes: Sequence[str]) -> list[bool]:
+    """Return which classes are no objects, such as `__background__` of torchvision."""
+    return [name.strip("_").lower() == BACKGROUND for name in classes]
 
 
 def stored_names(raw: Any) -> list[str]:

@@ -251,3 +251,21 @@ def test_a_detector_of_torchvision_names_the_classes_of_coco_itself():
     assert isinstance(adapted.task, nb.Detection)
     assert [adapted.label(name) for name in ("banana", "apple", "orange")] == [52, 53, 55]
     assert len(set(adapted.classes)) == 91
+
+
+def test_boxes_of_a_background_are_no_detections_in_photographs():
+    """Raw networks such as SSD have scores of a background, which is the best class of most."""
+    boxes = torch.tensor([[0.0, 0.0, 4.0, 4.0], [4.0, 4.0, 8.0, 8.0]])
+
+    def decode(means: Tensor) -> list[dict[str, Tensor]]:
+        scores = torch.tensor([[0.0, 0.1], [0.9, 0.0]])
+        return [{"boxes": boxes, "scores": scores + mean * torch.eye(2)[1]} for mean in means]
+
+    photographs = torch.full((2, 3, 8, 8), 200, dtype=torch.uint8)
+    options = {
+        "task": nb.Detection(threshold=0.3, decode=decode),
+        "classes": ["_Background", "cup"],
+    }
+    found = nb.attack_photographs(lambda images: images.mean((1, 2, 3)), photographs, **options)
+    assert found.index.tolist() == [0, 1]
+    assert found.criterion.source.flatten().tolist() == [1, 1]
