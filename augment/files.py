@@ -272,8 +272,11 @@ def _read_exported(path: Path) -> Content:
         if any(value is True for value in compress(node.args, modes)):
             raise name_error(path, IN_TRAINING_MODE)
     # The network has one input, the images. Find the node of the graph that stands for it.
-    [name] = program.graph_signature.user_inputs
-    [node] = [node for node in program.graph.nodes if node.name == name]
+    images, *others = program.graph_signature.user_inputs
+    if others:
+        given = ", ".join(map(str, (images, *others)))
+        raise name_error(path, f"takes {given}: export it with one input, the images")
+    [node] = [node for node in program.graph.nodes if node.name == images]
     # `node.meta["val"]` is an example of the images. In its shape, the dimensions of fixed size are
     # whole numbers, and the others are symbols.
     shape = node.meta["val"].shape

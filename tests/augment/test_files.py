@@ -122,6 +122,19 @@ def test_a_copy_of_a_torchscript_network_is_trained_without_the_original(tmp_pat
     torch.testing.assert_close(original(images), before)
 
 
+class Masked(nn.Module):
+    def forward(self, images: torch.Tensor, mask: torch.Tensor) -> torch.Tensor:
+        return (images * mask).mean((2, 3))
+
+
+def test_an_exported_network_of_several_inputs_is_refused_with_their_names(tmp_path):
+    path = tmp_path / "network.pt2"
+    given = torch.rand(1, 3, SIZE, SIZE), torch.ones(1, 1, SIZE, SIZE)
+    torch.export.save(torch.export.export(Masked(), given), path)
+    with pytest.raises(InputError, match="takes images, mask: export it with one input"):
+        load_classifier(str(path), trust_code=True)
+
+
 class Payload:
     def __init__(self, path: Path):
         self.path = path
