@@ -11,8 +11,7 @@ import math
 import warnings
 from bisect import bisect
 from collections import UserDict
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Mapping, Sequence
 from copy import copy
 from functools import cache
 from itertools import accumulate
@@ -27,7 +26,7 @@ from torch.utils._pytree import SequenceKey, tree_flatten_with_path, tree_unflat
 from torchvision import tv_tensors
 from torchvision.transforms import v2
 
-from augment.random_streams import generator, seeded, stream_seed
+from augment.random_streams import generator, seeded, stream_seed, usual_defaults
 from augment.scene import loops
 from augment.scene.lights import MODELS, Drawn, Illumination, LightModel, LowLight, normal_noise
 from augment.scene.loops import BIN_BITS, BINS
@@ -149,7 +148,7 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
         count = max([math.prod(_batch_shape(image)) for image in flat_inputs], default=1)
         models, weights = [*self.lights], [*self.lights.values()]
         lights: list[Light | None] = []
-        with _usual_defaults():
+        with usual_defaults():
             seeds = torch.randint(2**62, (count,)).tolist()
             for seed, (chance, choice) in zip(seeds, torch.rand(count, 2).tolist(), strict=True):
                 # Draw a model with a probability in proportion to its weight.
@@ -309,22 +308,9 @@ def relight_photographs(
         slides = as_photographs("slides", slides)
     count, _, *shape = photographs.shape
     # Photographs stand for the albedo, and the light of the projector multiplies it.
-    with _usual_defaults():
+    with usual_defaults():
         light = draw_projected_light(count, shape, generator(seed, "relight"), slides)
         return to_bytes(light.to(photographs.device).expose(decode(to_unit(photographs), "srgb")))
-
-
-@contextmanager
-def _usual_defaults() -> Iterator[None]:
-    """Create tensors on the CPU in 32 bits, in a `with` block."""
-    with ExitStack() as stack:
-        made = torch.empty(0)  # Ten times as fast as `torch.get_default_device`.
-        if made.device.type != "cpu":
-            stack.enter_context(torch.device("cpu"))
-        if made.dtype != torch.float32:
-            stack.callback(torch.set_default_dtype, made.dtype)
-            torch.set_default_dtype(torch.float32)
-        yield
 
 
 def _key_of(path: Sequence[Any]) -> Any:
@@ -423,7 +409,7 @@ def _apply_to_tensor(image: Tensor, lights: Sequence[Light | None], depth: Any) 
         of_kind = zip(lights, keys, strict=True)
         chosen = [light for light, key in of_kind if light and key == kinds[kind]]
         depth_of_rows = None if depths is None else depths[rows]
-        with _usual_defaults():
+        with usual_defaults():
             return _relight(frames[rows], chosen, depth_of_rows) if chosen else frames[rows]
 
     relit = by_kind([kinds.index(key) for key in keys], relight)

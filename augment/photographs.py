@@ -308,7 +308,7 @@ def _attack(
         seed=seed,
         predicted={light: torch.empty(shape, dtype=torch.int64) for light in lights},
         changed={light: torch.zeros(shape, dtype=torch.bool) for light in lights},
-        log_gain={light: torch.zeros(shape_of_gains) for light in lights},
+        log_gain={light: torch.zeros(shape_of_gains, dtype=torch.float32) for light in lights},
     )
     batches = torch.arange(len(index)).split(success.batch_size)
     with wrappers.frozen_eval_mode(classifier):

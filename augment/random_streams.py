@@ -2,7 +2,7 @@
 
 import zlib
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import numpy as np
 import torch
@@ -29,4 +29,17 @@ def seeded(seed: int) -> Iterator[None]:
     with torch.random.fork_rng(devices=[]):
         # `torch.manual_seed` would also seed the generators of GPUs.
         torch.default_generator.manual_seed(seed)
+        yield
+
+
+@contextmanager
+def usual_defaults() -> Iterator[None]:
+    """Create tensors on the CPU in 32 bits, in a `with` block."""
+    with ExitStack() as stack:
+        made = torch.empty(0)  # Ten times as fast as `torch.get_default_device`.
+        if made.device.type != "cpu":
+            stack.enter_context(torch.device("cpu"))
+        if made.dtype != torch.float32:
+            stack.callback(torch.set_default_dtype, made.dtype)
+            torch.set_default_dtype(torch.float32)
         yield

@@ -21,6 +21,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Generator, Tensor
 
+from augment.random_streams import usual_defaults
 from augment.scene.surfaces import between, draw_shading, smooth
 from renderer.errors import InputError, require_kind
 from renderer.image import LUMINANCE, clamp, decode, encode, to_unit
@@ -408,6 +409,7 @@ class ProjectedLight(NamedTuple):
         return encode(clamp(exposure * radiance), "srgb")
 
 
+@usual_defaults()
 def draw_projected_light(
     count: int, size: Size, draws: Generator, photographs: UInt8[Tensor, "N 3 H W"] | None = None
 ) -> ProjectedLight:

@@ -80,6 +80,17 @@ def test_photographs_are_attacked_alike_in_inference_mode(result, photographs):
         assert torch.equal(again.changed[light], changed)
 
 
+def test_photographs_are_in_the_same_light_with_another_default_type_of_torch(result, photographs):
+    network = HueNetwork().eval()
+    try:
+        torch.set_default_dtype(torch.float64)
+        found = attack_photographs(network, photographs, SETTINGS, seed=1)
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert torch.equal(found.predicted["slide"], result.predicted["slide"])
+    assert {gain.dtype for gain in found.log_gain.values()} == {torch.float32}
+
+
 def test_photographs_are_attacked_alike_in_any_batch(result, photographs):
     again = attack_photographs(HueNetwork().eval(), photographs, SETTINGS, batch_size=5, seed=1)
     for light in LIGHTS:
