@@ -19,6 +19,7 @@ import warnings
 from collections.abc import Sequence
 from itertools import takewhile
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from types import ModuleType
 
 import numpy as np
@@ -28,7 +29,7 @@ from torch import Tensor
 
 from renderer.errors import MAX_MAGNITUDE, InputError, reading, require_file
 from renderer.image import to_rec709
-from renderer.io.files import read_numbers, replacing, write_numbers
+from renderer.io.files import atomic_write, read_numbers, write_numbers
 from renderer.light.harmonics import basis, equirectangular
 from renderer.settings import REC_709
 
@@ -160,11 +161,14 @@ def write_map(path: Path, radiance: Float[Tensor, "H W 3"]) -> None:
     if suffix == ".hdr":
         radiance = _to_rgbe_precision(radiance)
     image = _openimageio().ImageBuf(radiance.contiguous().numpy())
-    # A reader never sees a part of the new file.
-    with replacing(path) as temporary:
+    # OpenImageIO writes to no folder whose name UTF-8 cannot encode.
+    with TemporaryDirectory() as folder:
+        temporary = Path(folder, f"map{suffix}")
         # The data type "unknown" keeps the float32 values of the image.
         if not image.write(str(temporary), "unknown", suffix[1:]):
             raise OSError(errno.EIO, " ".join(image.geterror().split()), str(path))
+        # A reader never sees a part of the new file.
+        atomic_write(path, temporary.read_bytes())
 
 
 def _read_image(path: Path) -> tuple[np.ndarray, Sequence[str], Sequence[float]]:

@@ -1,6 +1,8 @@
 """Environment maps: quadrature on them, and files of each format."""
 
 import math
+import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -75,6 +77,15 @@ def test_arrays_and_exr_files_keep_float32_and_its_sign_to_the_bit(tmp_path, suf
     assert read.dtype == torch.float32
     assert torch.equal(read, radiance)
     assert list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems have no such names")
+@pytest.mark.parametrize("suffix", [".exr", ".hdr"])
+def test_a_map_is_written_to_a_folder_whose_name_is_not_utf_8(tmp_path, suffix):
+    path = tmp_path / os.fsdecode(b"m\xfcller") / f"map{suffix}"
+    write_map(path, radiance := random_map())
+    read = read_map(path.rename(tmp_path / path.name))
+    torch.testing.assert_close(read, radiance, rtol=0, atol=RGBE_ERROR * radiance.max().item())
 
 
 def test_the_error_of_a_hdr_file_is_half_a_unit_without_bias(tmp_path):
