@@ -192,4 +192,4 @@ def publish(
 
 def _without_folder(text: str) -> str:
     """Remove the folders, which other machines do not have, from absolute paths only."""
-    return Path(text).name if text.startswith("/") else text
+    return Path(text).name if Path(text).is_absolute() else text

@@ -1,6 +1,6 @@
 import json
 import math
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 from shutil import copytree
 
 import pytest
@@ -10,7 +10,7 @@ from safetensors import safe_open
 import norm_balls as nb
 from renderer.errors import InputError
 from renderer.io.images import read_image
-from train import checkpoints, run_folder
+from train import checkpoints, publication, run_folder
 from train.checkpoints import load_run, load_selected
 from train.data.sets import content_hash
 from train.results.store import summarize
@@ -143,3 +143,9 @@ def test_the_results_are_those_of_the_page(name):
     assert errors.value == pytest.approx(float(false_positive_rate), abs=3e-3)
     assert results["photographs/recall"].value == pytest.approx(float(recall), abs=5e-3)
     assert results["photographs/auc"].value == pytest.approx(float(auc.split()[0]), abs=1e-3)
+
+
+def test_folders_of_windows_are_not_published(monkeypatch):
+    monkeypatch.setattr(publication, "Path", PureWindowsPath)
+    assert publication._without_folder(r"C:\Users\me\pear.glb") == "pear.glb"
+    assert publication._without_folder(r"meshes\pear.glb") == r"meshes\pear.glb"
