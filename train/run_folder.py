@@ -108,8 +108,12 @@ def locked(folder: Path) -> Iterator[bool]:
     """
     folder.mkdir(parents=True, exist_ok=True)
     lock = FileLock(folder / LOCK)
-    with suppress(Timeout):
+    try:
         lock.acquire(blocking=False)
+    except OSError as error:
+        # The system names no file if the file system has no locks.
+        if not isinstance(error, Timeout):
+            raise OSError(error.errno, error.strerror, str(lock.lock_file)) from error
     if lock.is_locked:
         remove_unfinished(folder)
     try:

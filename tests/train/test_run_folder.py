@@ -1,3 +1,4 @@
+import errno
 import itertools
 import json
 import os
@@ -14,8 +15,9 @@ from renderer.errors import InputError
 from train import run_config
 from train.cli import read_settings
 from train.command_settings import AuditSettings
-from train.run_folder import METRICS, attack_success, read_metrics
+from train.run_folder import LOCK, METRICS, attack_success, locked, read_metrics
 from train.settings import ExperimentSettings
+from train.system import user_message
 from train.training.run_log import RunLog
 
 
@@ -209,3 +211,18 @@ def test_attack_success_is_the_fraction_of_the_clean_correct_examples():
     of_ten = {"attack_success_before": 0.2, "attack_success": 0.6}
     assert attack_success(of_ten) == pytest.approx(4 / 8)
     assert attack_success({"attack_success_before": 1.0, "attack_success": 1.0}) is None
+
+
+def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch):
+    """Some network file systems have no locks, and the system names no file then."""
+    fcntl = pytest.importorskip("fcntl")
+
+    def refuse(*_):
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with pytest.raises(OSError) as caught, locked(tmp_path):
+        pass
+    assert user_message(caught.value) == (
+        f"{tmp_path / LOCK} cannot be read or written: {os.strerror(errno.ENOLCK)}"
+    )
