@@ -136,10 +136,11 @@ def sole_writer(*folders: Path) -> Iterator[None]:
             yield
         finally:
             for folder in folders:
-                # Only the file of the lock is there.
+                # Only the file of the lock is there. Windows and NFS keep files that are open.
                 if [path.name for path in folder.iterdir()] == [LOCK]:
-                    (folder / LOCK).unlink()
-                    folder.rmdir()
+                    with suppress(OSError):
+                        (folder / LOCK).unlink()
+                        folder.rmdir()
 
 
 def state(folder: Path) -> str:

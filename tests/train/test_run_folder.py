@@ -15,7 +15,7 @@ from renderer.errors import InputError
 from train import run_config
 from train.cli import read_settings
 from train.command_settings import AuditSettings
-from train.run_folder import LOCK, METRICS, attack_success, locked, read_metrics
+from train.run_folder import LOCK, METRICS, attack_success, locked, read_metrics, sole_writer
 from train.settings import ExperimentSettings
 from train.system import user_message
 from train.training.run_log import RunLog
@@ -226,3 +226,17 @@ def test_a_file_system_without_locks_is_named(tmp_path, monkeypatch):
     assert user_message(caught.value) == (
         f"{tmp_path / LOCK} cannot be read or written: {os.strerror(errno.ENOLCK)}"
     )
+
+
+@pytest.mark.parametrize(
+    "method, error", [("unlink", PermissionError()), ("rmdir", OSError(errno.ENOTEMPTY, ""))]
+)
+def test_an_error_is_not_hidden_by_a_lock_that_is_kept(tmp_path, monkeypatch, method, error):
+    """Windows removes no open file, and NFS keeps it in its folder under another name."""
+
+    def refuse(*_, **options):
+        raise error
+
+    monkeypatch.setattr(Path, method, refuse)
+    with pytest.raises(InputError, match="mistake"), sole_writer(tmp_path / "out"):
+        raise InputError("mistake")
