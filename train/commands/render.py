@@ -10,6 +10,7 @@ from typing import Any
 from augment import dataset
 from augment.progress import progress
 from renderer.errors import InputError, keyed, keys_of
+from renderer.io.files import TEMPORARY
 from renderer.settings import height_and_width
 from train import console
 from train.checkpoints import load_chosen
@@ -105,14 +106,16 @@ def _describe(settings: RenderSettings, folder: Path, classes: list[str]) -> Non
         facts["shards"] = settings.shards  # A tar file has renders of one shard.
     # JSON makes the settings comparable with those in the file: tuples become lists.
     facts = json.loads(json.dumps(facts | {"classes": classes}, default=str))
+    # With --multirun, Hydra and submitit keep files in .launcher, as conf/render.yaml says. Another
+    # process may begin now: its first file is the description, so the folder is listed before.
+    names = {one.name for one in folder.iterdir() if not one.match(TEMPORARY)}
     if path.exists():
         found = read_json(path)
         changed = [key for key in facts if found.get(key) != facts[key]]
         if changed:
             raise InputError(f"out={folder} has another {changed[0]}: choose another folder", "out")
         require_same_inputs(folder, settings, found, "out=")
-    # With --multirun, Hydra and submitit keep files in .launcher, as conf/render.yaml says.
-    elif any(path.name != ".launcher" for path in folder.iterdir()):
+    elif names - {".launcher"}:
         raise InputError(f"out={folder} is not empty: choose a new folder", "out")
     else:
         write_json(path, facts | {"inputs": fingerprints(settings)}, indent=1)

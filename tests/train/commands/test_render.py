@@ -1,6 +1,7 @@
 import json
 import math
 import re
+import shutil
 import tarfile
 from collections import Counter
 from collections.abc import Iterator
@@ -23,6 +24,7 @@ from renderer.errors import InputError
 from scripts.render import main, name_light
 from train.command_settings import RenderSettings
 from train.commands.render import run
+from train.data.annotations import DATA_SET
 
 COUNT = 11
 MAPS = ["mask", "depth", "normals"]
@@ -248,6 +250,22 @@ def test_a_command_that_failed_before_its_first_render_can_be_corrected(meshes, 
     with pytest.raises(InputError, match="absent"):
         write(["absent.ply"], tmp_path / "out")
     assert len(pictures(write(meshes[:1], tmp_path / "out", count=1, maps=[]))) == 1
+
+
+def test_processes_that_begin_at_once_do_not_refuse_the_folder(meshes, tmp_path, monkeypatch):
+    out, listed = tmp_path / "out", Path.iterdir
+    first = write(meshes[:1], tmp_path / "first", count=1, maps=[])
+
+    def begun(folder):
+        """List the folder while another process writes its description."""
+        if folder == out:
+            (out / ".pnb-1.tmp").touch()
+        yield from listed(folder)
+        if folder == out:
+            shutil.copy(first / DATA_SET, out)
+
+    monkeypatch.setattr(Path, "iterdir", begun)
+    assert len(pictures(write(meshes[:1], out, count=1, maps=[]))) == 1
 
 
 def test_a_folder_of_other_files_is_refused(meshes, tmp_path):
