@@ -16,6 +16,7 @@ from pathlib import Path
 from runpy import run_path
 from typing import Any
 
+import torch
 from torch import Tensor, nn
 
 from augment import files, huggingface, progress
@@ -336,6 +337,7 @@ SOURCES: dict[str, Callable[..., Any]] = {
 }
 
 
+@torch.inference_mode(False)  # Attacks need autograd.
 def load_classifier(
     name: str,
     weights: str | Path | None = None,

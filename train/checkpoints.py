@@ -196,6 +196,7 @@ def with_task(network: TaskNetwork, settings: TaskSettings) -> TaskNetwork:
     return changed
 
 
+@torch.inference_mode(False)  # Attacks need autograd.
 def load_run(
     run: str | Path,
     weights: str | Path | None = None,

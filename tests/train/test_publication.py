@@ -149,3 +149,11 @@ def test_folders_of_windows_are_not_published(monkeypatch):
     monkeypatch.setattr(publication, "Path", PureWindowsPath)
     assert publication._without_folder(r"C:\Users\me\pear.glb") == "pear.glb"
     assert publication._without_folder(r"meshes\pear.glb") == r"meshes\pear.glb"
+
+
+def test_networks_that_are_loaded_in_inference_mode_have_gradients():
+    with torch.inference_mode():
+        networks = nb.load("none"), nb.load_classifier("efficientnet_lite0")
+    for network in networks:
+        tensors = [*network.parameters(), *network.buffers()]
+        assert not any(tensor.is_inference() for tensor in tensors)
