@@ -285,8 +285,9 @@ def measure(setup: Setup, draws: int, seed: int = 0) -> dict[str, np.ndarray]:
         (2, 2 · METRICS). There is no method "images" if an object has one image.
     """
     generator = np.random.default_rng(seed)
-    objects = [np.arange(count).repeat(setup.images) for count in setup.objects]
-    images = [np.arange(len(object_of_image)) for object_of_image in objects]
+    numbers = np.arange(sum(setup.objects) * setup.images)
+    images = np.split(numbers, [setup.objects[0] * setup.images])
+    objects = [number_of_image // setup.images for number_of_image in images]
     classes = [str(number % CLASSES) for number in objects[0]]
     overall = true_values(setup)
     rows: dict[str, list[np.ndarray]] = {}

@@ -261,15 +261,14 @@ def estimate(
             weights[:, images] = of_images
         return statistic(weights)[None]
 
-    # Units of a group count from 0.
     units = units or Units([np.arange(image_count)], "photographs")
     (every_unit,) = units.groups
-    unit_of_image = [np.unique(every_unit[images], return_inverse=True)[1] for images in groups]
+    unit_of_image = [every_unit[images] for images in groups]
     (result,) = leave_out(of_groups, Units(unit_of_image, units.over))
     # Images without objects do not change the recall, and without detections no precision either.
     # Such a group says nothing about the interval.
     if all((item == result.value).all() for item in result.without[1:]):
-        count = int(unit_of_image[0].max()) + 1
+        count = len({*unit_of_image[0].tolist()})
         result = replace(result, without=result.without[:1], unit_count=count)
     is_known = all(np.isfinite(item).all() for item in result.without)
     if result.unit_count < 2 or result.without[0].shape[-1] < MIN_UNITS or not is_known:

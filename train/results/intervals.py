@@ -32,8 +32,8 @@ class Units(NamedTuple):
     """Units over which an interval is taken: objects, or images.
 
     Attributes:
-        groups: For each group of images, the index of the unit that each image
-            belongs to, from 0, shape (n,).
+        groups: For each group of images, the number of the unit that each image
+            belongs to, shape (n,). Groups that have the same number share the unit.
         over: What the units are: OBJECTS, IMAGES or THESE_OBJECTS.
     """
 
@@ -125,28 +125,31 @@ def leave_out(statistic: Callable[..., np.ndarray], units: Units) -> list[Jackkn
     """Evaluate M statistics without each unit, or without each of MAX_PARTS parts of them.
 
     Images of the same object are not independent, so an object is left out with
-    all its images. The parts depend only on `units`. Metrics of two
+    all its images, of all groups. The parts depend only on `units`. Metrics of two
     networks on the same images are therefore paired. `statistic` takes, for each group, how often
     each of its n images counts, shape (k, n), and returns an array of shape (M, ..., k).
     """
     # Each image counts once at first. The axis of length 1 is for what is left out (`is_kept`).
     counts = [np.ones((1, len(unit_of_image)), int) for unit_of_image in units.groups]
     values = statistic(*counts)
-    unit_counts = [int(unit_of_image.max()) + 1 for unit_of_image in units.groups]
-    without = []
+    unit_counts = [len({*unit_of_image.tolist()}) for unit_of_image in units.groups]
+    without: list[np.ndarray] = []
     for group, unit_of_image in enumerate(units.groups):
-        unit_count = unit_counts[group]
-        if unit_count == 1:  # The only unit cannot be left out.
-            without.append(values)
+        # Units that earlier groups have, too, have been left out.
+        own = np.setdiff1d(unit_of_image, np.concatenate([[], *units.groups[:group]]))
+        if len(own) < 2:  # The only unit cannot be left out.
+            is_single = unit_counts[group] == 1
+            without.append(values if is_single else np.broadcast_to(values, without[0].shape))
             continue
-        part_count = min(unit_count, MAX_PARTS)
+        part_count = min(len(own), MAX_PARTS)
         # A random order divides the units into parts of about equal size.
-        order = np.random.default_rng(0).permutation(unit_count)
-        part_of_image = (order * part_count // unit_count)[unit_of_image]
-        # Row p leaves out the images of part p, shape (k, n).
-        is_kept = part_of_image != np.arange(part_count)[:, None]
-        # The images of all other groups remain.
-        without.append(statistic(*counts[:group], is_kept.astype(int), *counts[group + 1 :]))
+        order = np.random.default_rng(0).permutation(len(own))
+        part_of_unit = np.full(1 + max(map(np.max, units.groups)), -1)
+        part_of_unit[own] = order * part_count // len(own)
+        # Row p leaves out the images of part p, shape (k, n). The images of other units remain.
+        parts = np.arange(part_count)[:, None]
+        is_kept = ((part_of_unit[units_of] != parts).astype(int) for units_of in units.groups)
+        without.append(statistic(*is_kept))
     # One row for each of the M statistics.
     rows = zip(values[..., 0], *without, strict=True)
     return [Jackknife(value, others, min(unit_counts), units.over) for value, *others in rows]

@@ -376,13 +376,15 @@ def choose_units(*groups: Predictions) -> Units:
     Images show the same object if they have the same label and mesh. If the mesh of an image is
     unknown, images are the units.
     """
-    shown = [group.photograph for group in groups]
-    is_named = [bool(item.mesh) for items in shown for item in items]
+    items = [item for group in groups for item in group.photograph]
+    is_named = [bool(item.mesh) for item in items]
     has_enough = all(is_named) and all(len(_objects(group)) >= MIN_OBJECTS for group in groups)
-    objects = [[(item.label, item.mesh) for item in items] for items in shown]
-    images = [[item.path for item in items] for items in shown]
+    objects = [(item.label, item.mesh) for item in items]
+    images = [item.path for item in items]
     units, over = (objects, OBJECTS) if has_enough else (images, THESE_OBJECTS)
-    return Units([_number(names) for names in units], over if any(is_named) else IMAGES)
+    # With several labels, an image can be a positive and a negative.
+    numbers = np.split(_number(units), np.cumsum([*map(len, groups)])[:-1])
+    return Units(numbers, over if any(is_named) else IMAGES)
 
 
 def _objects(predictions: Predictions) -> set[object]:

@@ -75,7 +75,7 @@ def test_the_degrees_of_freedom_do_not_exceed_those_of_a_group_of_units(spread, 
         first = intervals.weighted_means(positives[None], positive_counts)
         return first - intervals.weighted_means(negatives[None], negative_counts)
 
-    units = intervals.Units([np.arange(6), np.arange(6)], "objects")
+    units = intervals.Units([np.arange(6), np.arange(6, 12)], "objects")
     (found,) = intervals.leave_out(difference, units)
     error = np.hypot(sem(positives), sem(negatives))
     ends = found.value + student_t(degrees).ppf(0.975) * error * np.array([-1, 1])
@@ -106,7 +106,7 @@ def test_without_pairs_the_interval_over_seeds_adds_the_variances_of_both_means(
 def test_two_runs_of_other_seeds_are_still_paired_by_their_images():
     draws = np.random.default_rng(0)
     positives, negatives = draws.normal(1, 1, 40), draws.normal(0, 1, 40)
-    units = intervals.Units([np.arange(40), np.arange(40)], "images")
+    units = intervals.Units([np.arange(40), np.arange(40, 80)], "images")
     after = intervals.leave_out_of_roc(positives + 0.1 * draws.normal(size=40), negatives, units)
     before = intervals.leave_out_of_roc(positives, negatives, units)
     for one, other in zip(after, before, strict=True):
@@ -130,7 +130,8 @@ def test_intervals_of_few_photographs_cover_the_recall_at_a_false_positive_rate(
 
 
 def roc_of(positives: np.ndarray, negatives: np.ndarray) -> list[intervals.Jackknife]:
-    units = intervals.Units([np.arange(len(positives)), np.arange(len(negatives))], "images")
+    numbers = np.arange(len(positives) + len(negatives))
+    units = intervals.Units(np.split(numbers, [len(positives)]), "images")
     return intervals.leave_out_of_roc(positives, negatives, units)
 
 
@@ -199,6 +200,26 @@ def test_means_over_drawn_classes_count_repeated_images():
         for way in range(2):
             expected = np.average(hits[way, drawn], weights=weights)
             assert intervals.class_means(hits, names, counts)[way, draw] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("labels", [["orange", "lemon"], ["orange", "lemon", "pear"]])
+def test_an_image_that_is_a_positive_and_a_negative_is_left_out_of_both(labels):
+    """Compare with the AUC of the other images. Their variance is that of the jackknife."""
+    shown = np.repeat(["orange", "lemon", "pear"], [6, 5, 4])
+    logits = torch.randn(15, 3, generator=torch.Generator().manual_seed(3))
+    logits += 2.0 * torch.eye(3)[np.arange(3).repeat([6, 5, 4])]
+
+    def auc_of(rows: np.ndarray) -> intervals.Jackknife:
+        return Pool(
+            ranked(shown[rows], logits[rows], ["orange", "lemon", "pear"], labels)
+        ).jackknives["auc"]
+
+    found = auc_of(np.arange(15))
+    others = [float(auc_of(np.delete(np.arange(15), row)).value) for row in range(15)]
+    is_positive = np.isin(shown, labels)
+    sides = [side for side in (is_positive, ~is_positive) if side.any()]
+    for side, without in zip(sides, found.without, strict=False):
+        assert sorted(without) == pytest.approx(sorted(np.array(others)[side]))
 
 
 @pytest.mark.parametrize("labels", [["orange"], ["orange", "lemon"]])
