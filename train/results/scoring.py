@@ -115,7 +115,8 @@ class Predictor:
 
 def _hashes(folder: Path, photographs: Sequence[Photograph], labels: list[str]) -> dict[str, str]:
     """Hash photographs with SHA-256, together with each label alone and, by "", with all labels."""
-    parts = {"": labels} | {label: [label] for label in labels}
+    # The order of the labels makes no difference.
+    parts = {"": sorted(labels)} | {label: [label] for label in labels}
     digests = {key: hashlib.sha256("\n".join(part).encode()) for key, part in parts.items()}
     for photograph in photographs:
         row = f"{photograph}{photograph.mesh or ''}".encode()

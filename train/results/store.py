@@ -136,7 +136,9 @@ class ScoredRun(NamedTuple):
     def pooled(self) -> Pool:
         """Read the predictions."""
         path = self.folder / PREDICTIONS
-        labels, thresholds = tuple(self.scores.labels), tuple(self.scores.thresholds.items())
+        # In one order, the predictions of all runs are paired.
+        labels = tuple(sorted(self.scores.labels))
+        thresholds = tuple(self.scores.thresholds.items())
         return _pool(path, path.stat().st_mtime_ns, labels, thresholds)
 
 

@@ -6,7 +6,9 @@ from shutil import copytree
 
 import numpy as np
 import pytest
+from PIL import Image
 
+import norm_balls as nb
 from tests.train.helpers import evaluation_of, ranked, read_markdown
 from train.results import compare as comparison
 from train.results.metrics import Pool
@@ -230,6 +232,26 @@ def test_without_the_metric_of_one_seed_there_is_no_difference(scored_run):
         assert comparison.difference(*pair, comparison.ALL, "auc") is None
     first = comparison.difference(lacking[:1], whole[:1], comparison.ALL, "auc")
     assert (first.before, first.value, first.after) == (0, 0.5, 0.5)
+
+
+def test_classes_that_are_named_in_another_order_are_compared(tmp_path):
+    classes = ["red", "green", "blue"]
+    draws = np.random.default_rng(0)
+    for name in classes:
+        (tmp_path / "photos" / name).mkdir(parents=True)
+        for number in range(12):
+            pixels = draws.integers(0, 256, (4, 4, 3), np.uint8)
+            Image.fromarray(pixels).save(tmp_path / "photos" / name / f"{number}.png")
+    runs = []
+    for labels in (["red", "blue"], ["blue", "red"]):
+        out = tmp_path / labels[0]
+        given = {"classes": classes, "size": 4, "out": out}
+        nb.evaluate(lambda images: images.mean((2, 3)), tmp_path / "photos", labels, **given)
+        runs.append(summarize(out))
+    [group] = comparison.group_by_images(comparison.store.group_by_method(runs)).values()
+    one, other = comparison.read_evaluations(group).values()
+    gain = comparison.difference(one, other, comparison.ALL, "auc")
+    assert gain.value == 0 and gain.high < 0.2
 
 
 @pytest.mark.parametrize("apples", [7, 5])
