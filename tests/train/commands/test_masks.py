@@ -26,6 +26,7 @@ def palette(*colors: tuple[int, int, int]) -> Image.Image:
 
 MASKS = {
     "white on black": Image.fromarray(WHITE_ON_BLACK),
+    "nearly white on nearly black": Image.fromarray(np.where(IS_OBJECT, 251, 4).astype(np.uint8)),
     "one bit": Image.fromarray(WHITE_ON_BLACK).convert("1"),
     "zero and one": Image.fromarray(IS_OBJECT.astype(np.uint8)),
     "16 bits": Image.fromarray(WHITE_ON_BLACK.astype(np.uint16) * 257),
