@@ -163,7 +163,7 @@ def fit_scene(
     Raises:
         InputError: If the photograph or the mask has a wrong shape, or if the
             mask covers fewer than `MIN_COVERED_PIXELS` pixels, or no pixel by
-            more than `HALF_PIXEL`.
+            more than `WHOLE_PIXEL`.
 
     Example:
         >>> import norm_balls as nb
@@ -182,9 +182,9 @@ def fit_scene(
     size = photograph.shape[-1]
     require_shape("photograph", photograph, CHANNELS, size, size)
     require_shape("mask", mask, size, size)
-    if mask.sum() < MIN_COVERED_PIXELS or mask.max() <= HALF_PIXEL:
+    if mask.sum() < MIN_COVERED_PIXELS or mask.max() <= WHOLE_PIXEL:
         covered = f"covers {float(mask.sum()):.0f} pixels of {size} × {size}"
-        fault = f"{covered}, and the largest share of a pixel is {float(mask.max()):.2g}"
+        fault = f"{covered}, and the largest share of a pixel is {float(mask.max()):.3g}"
         advice = f"is 1 where the object is, in at least {MIN_COVERED_PIXELS} pixels"
         raise InputError(f"the mask {fault}: give a mask that {advice}")
     # Arguments of `render` and `precompute_transfer` for all images that are compared.

@@ -112,7 +112,7 @@ def test_the_polar_angle_of_the_camera_is_found_from_an_image_of_a_round_object(
     assert found.camera.polar == pytest.approx(camera.polar, abs=1)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.4])
+@pytest.mark.parametrize("share", [0.0, 0.4, 254 / 255])
 def test_a_mask_of_nothing_is_refused(share):
     mesh = renderer.normalize(renderer.solid("apple"))
     with pytest.raises(InputError, match="mask"):
