@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache, partial
-from inspect import signature
 from itertools import cycle, groupby, islice, product
 from typing import Any
 
@@ -37,6 +36,7 @@ AT_ONCE = 2**24
 MAX_VIEWS_WITHOUT_PROGRESS = 8
 
 
+@dataclass(eq=False, repr=False)
 class Scene:
     """E examples, each of which shows an object from V cameras in front of a background.
 
@@ -85,35 +85,31 @@ class Scene:
         torch.Size([2, 1, 3, 8, 8])
     """
 
-    def __init__(
-        self,
-        objects: Sequence[SceneObject],
-        examples: Sequence[Example],
-        backgrounds: Tensor,
-        lights: Tensor,
-        settings: ImageSettings,
-        rasterizer: Rasterizer,
-        basis: Basis = HARMONICS,
-        camera_effects: Callable[[Tensor, Tensor], Tensor] | None = None,
-        one_light: bool = False,
-        lights_of_degree: Callable[[int, float | None], tuple[Basis, Tensor]] | None = None,
-    ):
-        self.objects = errors.as_list("objects", objects, SceneObject, "a list of scene objects")
-        examples = errors.as_list("examples", examples, Example, "a list of examples")
-        lights = errors.as_tensor("lights", lights)
-        backgrounds = errors.as_tensor("backgrounds", backgrounds)
+    objects: Sequence[SceneObject]
+    examples: Sequence[Example]
+    backgrounds: Tensor
+    lights: Tensor
+    settings: ImageSettings
+    rasterizer: Rasterizer
+    basis: Basis = HARMONICS
+    camera_effects: Callable[[Tensor, Tensor], Tensor] | None = None
+    one_light: bool = False
+    lights_of_degree: Callable[[int, float | None], tuple[Basis, Tensor]] | None = None
+
+    def __post_init__(self) -> None:
+        """Check the arguments, and prepare the renderers."""
+        settings, basis = self.settings, self.basis
+        kind = "a list of scene objects"
+        self.objects = errors.as_list("objects", self.objects, SceneObject, kind)
+        examples = errors.as_list("examples", self.examples, Example, "a list of examples")
+        lights = errors.as_tensor("lights", self.lights)
+        backgrounds = errors.as_tensor("backgrounds", self.backgrounds)
         effects = "a function of images and examples"
         errors.require_kind("settings", settings, ImageSettings, "nb.ImageSettings(size)")
         errors.require_kind("basis", basis, Basis, "a basis of light, such as Harmonics(degree)")
-        errors.require_kind("camera_effects", camera_effects, Callable | None, effects)
+        errors.require_kind("camera_effects", self.camera_effects, Callable | None, effects)
         chosen_by = "renderer.visibility.choose(name)"
-        errors.require_kind("rasterizer", rasterizer, Rasterizer, chosen_by)
-        self.settings = settings
-        self.rasterizer = rasterizer
-        self.basis = basis
-        self.camera_effects = camera_effects
-        self.one_light = one_light
-        self.lights_of_degree = lights_of_degree
+        errors.require_kind("rasterizer", self.rasterizer, Rasterizer, chosen_by)
         self._require_fit(examples, lights, backgrounds)
         # The depth range of each camera must contain the whole object.
         self.examples = []
@@ -136,7 +132,7 @@ class Scene:
         self.group_size = max(1, AT_ONCE // (self.views * settings.pixel_count))
         self.attack_bytes = self._count_attack_bytes()
         # Images are numbered by example and then by view: e · V + v.
-        built_with: dict[str, Any] = {"rasterizer": rasterizer, "basis": basis}
+        built_with: dict[str, Any] = {"rasterizer": self.rasterizer, "basis": basis}
         # On devices other than CUDA, operators are computed on the CPU, and their stacks are moved.
         built_with["device"] = device if device.type == "cuda" else "cpu"
         self._operator_renderer = OperatorRenderer(
@@ -149,9 +145,8 @@ class Scene:
             partial(build_operators, settings=settings, dtype=lights.dtype, **built_with),
             attack_bytes=self.attack_bytes,
         )
-        self._direct_renderer = DirectRenderer(
-            self.objects, settings, rasterizer, basis, like=self.lights, one_light=one_light
-        )
+        shown = self.objects, settings, self.rasterizer, basis, self.lights, self.one_light
+        self._direct_renderer = DirectRenderer(*shown)
 
     def require_memory(self) -> None:
         """Check that there is memory for an attack on all examples."""
@@ -231,9 +226,7 @@ class Scene:
         Args:
             arguments: Arguments of `Scene` that differ in the copy, by name.
         """
-        # Each argument is also an attribute of this name.
-        present = {name: getattr(self, name) for name in signature(Scene).parameters}
-        copy = Scene(**present | arguments)
+        copy = replace(self, **arguments)
         kinds = [(lights.dtype, lights.device) for lights in (copy.lights, self.lights)]
         if arguments.keys() == {"lights"} and kinds[0] == kinds[1]:
             # Operators, with their shadows, are the same in any light, so they are built once.
