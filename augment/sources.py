@@ -80,9 +80,9 @@ def _torchvision(
     there is none, from the default set. Values in `facts` take precedence. Without a file of
     weights, the default set is downloaded and kept.
     """
-    from torchvision.models import get_model, get_model_weights
+    from torchvision.models import get_model_weights
 
-    require_architecture(model)
+    _require_architecture(model)
     name = f"torchvision:{model}"
     sets = get_model_weights(model)
     # A set without names of classes has no last layer.
@@ -95,14 +95,10 @@ def _torchvision(
     def build(facts: NetworkFacts) -> Classifier:
         size = facts.size or transforms.crop_size[0]
         classes = facts.classes or tuple(published.meta["categories"])
-        options: dict[str, Any] = {"num_classes": len(classes)}
-        if model in CONVERTING:
-            options |= {"transform_input": True, "init_weights": False, "aux_logits": False}
-        if model.startswith("vit_"):
-            options["image_size"] = size
         # A transformer takes squares that its patches fill.
         with files.reading_network(name, "cannot be built", "give another size="):
-            network = get_model(model, **options)
+            converting = {"transform_input": True, "init_weights": False}
+            network = build_torchvision(model, len(classes), size, **converting)
         return _classifier(network, name, facts, size, classes, transforms.mean, transforms.std)
 
     if is_random:
@@ -180,7 +176,24 @@ def _size_for_positions(own_size: int, own_state: State, state: State) -> int | 
     return None
 
 
-def require_architecture(model: str) -> None:
+def build_torchvision(model: str, class_count: int, size: Size, **converting: bool) -> nn.Module:
+    """Build a classifier of torchvision with random weights.
+
+    `converting` are further arguments of those in `CONVERTING`.
+    """
+    from torchvision.models import get_model
+
+    _require_architecture(model)
+    options: dict[str, Any] = {"num_classes": class_count}
+    # With auxiliary classifiers, a network would return several outputs.
+    if model in CONVERTING:
+        options |= {"aux_logits": False, **converting}
+    if model.startswith("vit_"):
+        options["image_size"] = size
+    return get_model(model, **options)
+
+
+def _require_architecture(model: str) -> None:
     """Check that torchvision has a classifier of a given name."""
     from torchvision import models
 

@@ -16,7 +16,7 @@ from augment import distributed
 from augment.files import NetworkFacts
 from augment.network import ChannelNormalization, Network, eval_mode, plain_outputs
 from augment.settings import PYTHON
-from augment.sources import call_python, load_source, require_architecture
+from augment.sources import build_torchvision, call_python, load_source
 from renderer.errors import InputError, explained
 from renderer.settings import Size
 from train.settings import WIDERESNET
@@ -183,7 +183,8 @@ def build_network(
             network = _call_function(name, classes, size)
         else:
             # Networks of torchvision take normalized images, so a layer before them normalizes.
-            built = _build_architecture(name.removeprefix(TORCHVISION), len(classes), size)
+            model = name.removeprefix(TORCHVISION)
+            built = build_torchvision(model, len(classes), size, init_weights=True)
             network = Network(built, [ChannelNormalization(mean, std)])
         with eval_mode(network), torch.no_grad():
             # Two images are tried, since a wrong number of classes is found only here.
@@ -202,20 +203,6 @@ def _call_function(name: str, classes: Sequence[str], size: int) -> nn.Module:
         fault = f"is for {own_size} pixels per side and classes such as {own_classes[0]!r}"
         raise InputError(f"name={name} {fault}: return the size and classes of the data", "name")
     return network
-
-
-def _build_architecture(architecture: str, class_count: int, size: int) -> nn.Module:
-    """Build an architecture of torchvision with random weights."""
-    from torchvision import models
-
-    require_architecture(architecture)
-    options: dict[str, Any] = {}
-    # With auxiliary classifiers, a network would return several outputs.
-    if architecture in ("googlenet", "inception_v3"):
-        options = {"aux_logits": False, "init_weights": True}
-    if architecture.startswith("vit_"):
-        options = {"image_size": size}
-    return models.get_model(architecture, weights=None, num_classes=class_count, **options)
 
 
 def describe(
