@@ -245,9 +245,7 @@ def _as_found(boxes: Any, labels: Any) -> dict[str, Tensor]:
 
 def _in_float32(outputs: Any) -> Any:
     """Convert floating-point outputs of a network, in which costs of half precision would round."""
-    return tree_map_only(
-        Tensor, lambda item: item.float() if item.is_floating_point() else item, outputs
-    )
+    return tree_map_only(Tensor, lambda of: of.float() if of.is_floating_point() else of, outputs)
 
 
 def _leaf(light: Light) -> Light:

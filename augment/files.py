@@ -272,11 +272,10 @@ def _read_exported(path: Path) -> Content:
         if any(value is True for value in compress(node.args, modes)):
             raise name_error(path, IN_TRAINING_MODE)
     # The network has one input, the images. Find the node of the graph that stands for it.
-    images, *others = program.graph_signature.user_inputs
-    if others:
-        given = ", ".join(map(str, (images, *others)))
-        raise name_error(path, f"takes {given}: export it with one input, the images")
-    [node] = [node for node in program.graph.nodes if node.name == images]
+    inputs = program.graph_signature.user_inputs
+    if len(inputs) > 1:
+        raise name_error(path, f"takes {', '.join(map(str, inputs))}: export it for images alone")
+    [node] = [node for node in program.graph.nodes if node.name == inputs[0]]
     # `node.meta["val"]` is an example of the images. In its shape, the dimensions of fixed size are
     # whole numbers, and the others are symbols.
     shape = node.meta["val"].shape
@@ -366,16 +365,13 @@ class InBatches(Network):
         last_count = (len(shown) - 1) % self.most + 1
         missing_count = max(0, self.least - last_count)
         filled = torch.cat([shown, shown[:1].expand(missing_count, -1, -1, -1)])
-        batches = filled.split(self.most)
-        parts = [self.network(batch) for batch in batches]
-        for batch, part in zip(batches, parts, strict=True):
-            # A file that suppresses boxes itself has a row for each box that is left.
-            wrong = [leaf for leaf in tensors_of(part) if leaf.shape[:1] != batch.shape[:1]]
-            if wrong:
-                returned = f"{tuple(wrong[0].shape)} for a batch of {len(batch)}"
-                advice = "export it without suppression of boxes, or write a python: function"
-                raise InputError(f"the file returned {returned}, not one row per image: {advice}")
-        joined = tree_map(lambda *of: torch.cat(of)[: len(images)], *parts)
+        parts = [self.network(batch) for batch in filled.split(self.most)]
+        joined = tree_map(lambda *of: torch.cat(of), *parts)
+        # A file that suppresses boxes itself has a row for each box that is left.
+        if any(len(leaf) != len(filled) for leaf in tensors_of(joined)):
+            advice = "export it without suppression of boxes, or write a python: function"
+            raise InputError(f"the file did not return one row for each image: {advice}")
+        joined = tree_map(lambda leaf: leaf[: len(images)], joined)
         return tuple(joined) if isinstance(joined, list) else joined
 
 

@@ -20,15 +20,7 @@ from torch import Tensor
 
 from augment.network import unwrapped
 from augment.scene.truth import Truth
-from augment.tasks.task import (
-    NO_CLASS,
-    GetTruth,
-    ObjectCriterion,
-    Task,
-    are_background,
-    stored_names,
-    unique_names,
-)
+from augment.tasks.task import NO_CLASS, GetTruth, ObjectCriterion, Task, stored_names, unique_names
 from renderer import errors
 from renderer.errors import InputError
 from renderer.image import to_bytes, to_unit
@@ -207,7 +199,7 @@ class Detection(Task):
         image = torch.repeat_interleave(torch.tensor([len(item["scores"]) for item in outputs]))
         options: dict[str, Any] = {"task": self, "class_count": len(classes)}
         criterion = DetectionCriterion(labels[:, None], boxes=boxes[:, None], **options)
-        is_background = torch.tensor(are_background(classes), device=labels.device)
+        is_background = torch.tensor(self.are_background(classes), device=labels.device)
         is_found = (scores >= self.threshold) & ~is_background[labels]
         image, criterion = image[is_found.cpu()], criterion.select(is_found)
         # Each example has one view, so its single image can be judged without the axis of views.

@@ -19,7 +19,7 @@ from torch import Tensor
 from augment.network import plain_outputs, unwrapped
 from augment.scene.truth import Truth
 from augment.tasks.detection import log_odds_of
-from augment.tasks.task import GetTruth, ObjectCriterion, Reader, Task, are_background, stored_names
+from augment.tasks.task import GetTruth, ObjectCriterion, Reader, Task, stored_names
 from renderer.errors import InputError, describe, require_number
 
 # Least fraction of an image that shows an object.
@@ -115,7 +115,7 @@ class Segmentation(Task):
         """
         label = outputs.argmax(1)
         area = F.one_hot(label, outputs.shape[1]).float().mean((1, 2))
-        area[:, are_background(classes)] = 0
+        area[:, self.are_background(classes)] = 0
         # One example for each pair of an image and a class that it shows.
         image, source = (area >= LEAST_AREA).nonzero(as_tuple=True)
         masks = label[image] == source[:, None, None]

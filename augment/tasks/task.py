@@ -161,6 +161,10 @@ class Task(ABC):
         """Return all outputs of a network that the task can use."""
         return network(images)
 
+    def are_background(self, classes: Sequence[str]) -> list[bool]:
+        """Return which classes are no objects, such as `__background__` of torchvision."""
+        return [name.strip("_").lower() == BACKGROUND for name in classes]
+
     @abstractmethod
     def reader(self, title: str, class_count: int | None = None) -> Reader:
         """Return a function that checks the outputs of a network and brings them into one form.
@@ -252,11 +256,6 @@ def gradient_of(values: Tensor, images: Tensor, weights: Tensor | None = None) -
 def unique_names(names: Sequence[str]) -> list[str]:
     """Add its index to each name that occurs twice, because labels are found by name."""
     return [f"{name} {i}" if names.count(name) > 1 else name for i, name in enumerate(names)]
-
-
-def are_background(classes: Sequence[str]) -> list[bool]:
-    """Return which classes are no objects, such as `__background__` of torchvision."""
-    return [name.strip("_").lower() == BACKGROUND for name in classes]
 
 
 def stored_names(raw: Any) -> list[str]:

@@ -280,9 +280,7 @@ def beside_textures(
     Programs for scans write the same color at vertices and in the texture. No product is meant.
     """
     if (colors[is_textured] < 1).any():
-        file.assume(
-            "the texture is taken as the color, and not the colors of its vertices or faces"
-        )
+        file.assume("the texture is taken as the color, not the colors of its vertices or faces")
     return np.where(is_textured[:, None, None], 1.0, colors)
 
 

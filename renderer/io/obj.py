@@ -275,9 +275,7 @@ def _material(name: str, library: dict[str, _Definition] | None, file: MeshFile)
                     values = [value / max(1.0, *values) for value in values]
                 is_color = all(0 <= value <= 1 + mesh_file.TOLERANCE for value in values)
                 if len(values) not in (1, 3) or not is_color:
-                    raise ValueError(
-                        f'"{keyword} {text}" is no color: give red, green, blue from 0 to 1'
-                    )
+                    raise ValueError(f'"{keyword} {text}" is no color: give R, G, B from 0 to 1')
                 color = tuple(min(value, 1.0) for value in values * (3 // len(values)))
             case key if key == texture_key:
                 path = _NEUTRAL_OPTIONS.sub("", text, count=1)

@@ -15,7 +15,6 @@ In shapes, `size` is the number of functions of a basis.
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -252,11 +251,7 @@ class LocalBasis(Basis):
 
     @abstractmethod
     def connect(
-        self,
-        points: Tensor,
-        normals: Tensor,
-        positions: Tensor | None = None,
-        lobe_width: float = math.inf,
+        self, points: Tensor, normals: Tensor, positions: Tensor | None, lobe_width: float
     ) -> LightPaths:
         """Find the straight paths from light sources to S surface points, without shadows.
 

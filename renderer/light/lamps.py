@@ -104,11 +104,7 @@ class Projector(Settings, LocalBasis):
         return coefficients.view(self.pixels, self.pixels, 3) / self.power
 
     def connect(
-        self,
-        points: Tensor,
-        normals: Tensor,
-        positions: Tensor | None = None,
-        lobe_width: float = math.inf,
+        self, points: Tensor, normals: Tensor, positions: Tensor | None, lobe_width: float
     ) -> LightPaths:
         """Find the straight path from the projector to each surface point that it lights.
 
@@ -287,11 +283,7 @@ class Lamps(LocalBasis):
         return replace(self, positions=tuple(map(tuple, positions.tolist())))
 
     def connect(
-        self,
-        points: Tensor,
-        normals: Tensor,
-        positions: Tensor | None = None,
-        lobe_width: float = math.inf,
+        self, points: Tensor, normals: Tensor, positions: Tensor | None, lobe_width: float
     ) -> LightPaths:
         """Find the straight paths from lamps to surface points, without shadows.
 

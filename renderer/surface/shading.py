@@ -404,12 +404,10 @@ def normals_in_sight(
     return normals.T.index_select(1, seen_ids).unflatten(1, (3, -1)).permute(2, 1, 0)
 
 
-def smooth_normals(
-    fragments: Fragments, corner_normals: Float[Tensor, "G 3 3"]
-) -> Float[Tensor, "S 3"]:
+def smooth_normals(fragments: Fragments, normals: Float[Tensor, "G 3 3"]) -> Float[Tensor, "S 3"]:
     """Interpolate the normals at corners to the samples of a view.
 
     The normals of faces that are seen from behind are reversed, so that they
     point to the side of the camera. The interpolated normals are not of unit length.
     """
-    return fragments.interpolate(corner_normals * fragments.facing[:, :, None].to(corner_normals))
+    return fragments.interpolate(normals * fragments.facing[:, :, None].to(normals))

@@ -280,9 +280,7 @@ def relit_sections(results: Mapping[str, Path]) -> list[dict[str, Any]]:
         unreadable_count = len(scores.unreadable)
         # Only a part of the photographs is attacked.
         if scores.shown + unreadable_count < scores.found:
-            sentences.append(
-                f"The folder holds {scores.found} photographs, of which these are some."
-            )
+            sentences.append(f"The folder has {scores.found} photographs, of which these are some.")
         if unreadable_count:
             sentences.append(f"{unreadable_count} photographs cannot be read.")
         pictures: list[Picture] = []

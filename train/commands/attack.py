@@ -326,9 +326,7 @@ def format_reloaded(
     compared = [f"rendered again at {height} × {width} pixels"] * len(images)
     if images.shape == saved.shape:
         levels = (255 * (images - saved.to(images)).abs().flatten(1).amax(1)).tolist()
-        compared = [
-            f"values differ from the saved image's by {one:.3g}/255 at most" for one in levels
-        ]
+        compared = [f"values differ from those saved by {one:.3g}/255 at most" for one in levels]
     named = classifier.task.found(evidence[0], criterion.predicted(evidence)[0], classifier.classes)
     return [
         f"view {view}: {label} is recognized as {named['predicted'][view]} "

@@ -194,9 +194,7 @@ def logged_to(path: Path, prefix: str = "", level: int = logging.INFO) -> Iterat
             handler.close()
 
 
-def sweep(
-    start: Callable[[], None], runs: Sequence[Sequence[str]], first_config: DictConfig
-) -> None:
+def sweep(start: Callable[[], None], runs: Sequence[Sequence[str]], first: DictConfig) -> None:
     """Train all runs of a sweep, print a table of their results, and write a report.
 
     Wrong settings, and folders of other runs, are found before any training. The exit status is 1
@@ -209,13 +207,13 @@ def sweep(
         raise InputError("out= and hydra.sweep name no folder of a sweep: name it with sweep=")
     if "launcher=slurm" in runs[0] and not shutil.which("sbatch"):
         raise InputError("launcher=slurm needs the command sbatch: start on the cluster")
-    if first_config.photographs_first:
+    if first.photographs_first:
         raise InputError("photographs_first=true makes no sweep: start the runs one by one")
-    if first_config.compare:
-        raise InputError(f"compare={first_config.compare} makes no sweep: give augment=none,random")
-    parent = writable_folder(str(first_config.sweep), "sweep")
+    if first.compare:
+        raise InputError(f"compare={first.compare} makes no sweep: give augment=none,random")
+    parent = writable_folder(str(first.sweep), "sweep")
     # An earlier report about the same sweep may be replaced.
-    require_replaceable(parent, "sweep", first_config.overwrite, own=[PAGE])
+    require_replaceable(parent, "sweep", first.overwrite, own=[PAGE])
     shared_keys = [word.partition("=")[0] for word in set.intersection(*map(set, runs))]
     folders = [parent / run_name(overrides, shared_keys, str(parent)) for overrides in runs]
     if len(set(folders)) < len(runs):

@@ -15,14 +15,7 @@ from augment.settings import ObjectSettings, RendererSettings
 from renderer.camera import Camera, PerspectiveCamera
 from renderer.errors import InputError, explained, import_package, require_file
 from renderer.image import decode, encode
-from renderer.io.images import (
-    eight_bits,
-    open_image,
-    read_image,
-    read_rgb,
-    turn_upright,
-    write_image,
-)
+from renderer.io import images
 from renderer.light.files import save_light
 from renderer.photograph import fit_photograph
 from train.cli import quoted
@@ -55,7 +48,7 @@ def run(settings: FitSettings) -> None:
     """Find camera and lighting of a photograph, and print a command that attacks the lighting."""
     with explained(f"{settings.photograph} cannot be read", "give an image file"):
         # The full size, because images whose shorter side has more pixels than this may be reduced.
-        image = np.asarray(read_rgb(settings.photograph, 10**6))
+        image = np.asarray(images.read_rgb(settings.photograph, 10**6))
     out = output_folder(settings.out, settings.overwrite)
     # The mask is 255 where the object is, shape (H, W).
     if settings.mask:
@@ -69,17 +62,17 @@ def run(settings: FitSettings) -> None:
     out.mkdir(parents=True, exist_ok=True)
     # The window is the square of the photograph that the found camera shows.
     background = fitted.window.cut(image, BACKGROUND_SIZE, settings.encoding)
-    write_image(out / "background.png", encode(background, settings.encoding))
+    images.write_image(out / "background.png", encode(background, settings.encoding))
     # Outside of the photograph, there is no object.
     coverage = fitted.window.cut(mask[..., None], BACKGROUND_SIZE, beyond=0)
-    write_image(out / "mask.png", coverage.expand(3, -1, -1))
+    images.write_image(out / "mask.png", coverage.expand(3, -1, -1))
     save_light(out / "light.json", fitted.scene.light)
     # The result is checked in the picture that pnb-attack will render from the written files.
     scene, renderer = attacked_scene(settings, fitted.scene.camera, out)
     photograph, rendered = render_attacked(mesh_settings, scene, renderer)
-    write_image(out / "comparison.png", torch.cat([photograph, rendered], dim=2))
+    images.write_image(out / "comparison.png", torch.cat([photograph, rendered], dim=2))
     # The three channels of the mask are equal, so the first one is enough.
-    is_object = read_image(out / "mask.png", ATTACKED_SIZE)[0] > MIN_COVERAGE
+    is_object = images.read_image(out / "mask.png", ATTACKED_SIZE)[0] > MIN_COVERAGE
     # Relative root mean square error in linear RGB.
     # Both have the shape (3, n), with the n pixels of the object.
     linear = decode(photograph[:, is_object].double(), settings.encoding)
@@ -190,10 +183,10 @@ def _levels(path: str) -> np.ndarray:
 
 def _pixels(path: str) -> np.ndarray:
     """Read the opacity or the only channel of an image, (H, W), or else its colors, (H, W, 3)."""
-    with open_image(path) as image:
-        turn_upright(image)
+    with images.open_image(path) as image:
+        images.turn_upright(image)
         if image.has_transparency_data:
-            rgba = np.asarray(eight_bits(image).convert("RGBA"))
+            rgba = np.asarray(images.eight_bits(image).convert("RGBA"))
             alpha = rgba[..., 3]
             # Constant opacity says nothing, so the colors do.
             if alpha.min() == alpha.max():
@@ -208,7 +201,7 @@ def _pixels(path: str) -> np.ndarray:
             return np.asarray(image.convert("RGB"))
         # Two values stay as they are, because 8 bits could make both black.
         values = np.asarray(image)
-        return values if len(np.unique(values)) <= 2 else np.asarray(eight_bits(image))
+        return values if len(np.unique(values)) <= 2 else np.asarray(images.eight_bits(image))
 
 
 def grab_cut(image: UInt8[np.ndarray, "H W 3"], box: list[int]) -> UInt8[np.ndarray, "H W"]:

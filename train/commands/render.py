@@ -45,9 +45,7 @@ def run(settings: RenderSettings) -> None:
     labels = [of.label for item in objects for of in (item, *item.others)]
     unlabeled = [other.mesh for item in objects for other in item.others if not other.label]
     if unlabeled:
-        console.warning(
-            "objects without a label are drawn, but not annotated: %s", ", ".join(unlabeled)
-        )
+        console.warning("unlabeled objects are drawn, but not annotated: %s", ", ".join(unlabeled))
     classes = [*dict.fromkeys(label for label in labels if label)]
     folder = writable_folder(settings.out, "out")
     for name in classes if settings.format == "imagefolder" else ():

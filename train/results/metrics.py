@@ -339,9 +339,7 @@ class Pool(ShortRepr):
         items = self.predictions.photograph
         labels = Counter(mesh for _, mesh in {(item.label, item.mesh) for item in items})
         shared = {mesh for mesh, count in labels.items() if mesh and count > 1}
-        names = [
-            f"{item.label}: {item.mesh}" if item.mesh in shared else item.mesh for item in items
-        ]
+        names = [f"{of.label}: {of.mesh}" if of.mesh in shared else of.mesh for of in items]
         return self._by_content(names)
 
     @cached_property

@@ -171,7 +171,7 @@ def test_derivatives_by_vertices_and_albedo_are_finite_differences(basis, normal
 
 
 def irradiance_of_lamp(position, radius, points, normals) -> Tensor:
-    paths = Lamps((tuple(position),), radius=radius).connect(points, normals)
+    paths = Lamps((tuple(position),), radius=radius).connect(points, normals, None, math.inf)
     total = torch.zeros(len(points), dtype=torch.float64)
     return total.index_add(0, paths.point, paths.irradiance)
 

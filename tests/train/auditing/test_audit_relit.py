@@ -54,4 +54,4 @@ def test_the_budget_limits_the_photographs(settings, tmp_path):
     # Of the twelve names in order, these are the first one, the seventh and the last one.
     shown = ["part_0/0.png", "part_1/1.png", "part_1/9.png"]
     assert [item.path for item in scores.photographs] == shown
-    assert "holds 12 photographs" in text
+    assert "has 12 photographs" in text
