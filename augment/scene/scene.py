@@ -297,15 +297,14 @@ class Scene:
     def cameras_under(self, conditions: Conditions, row: int, example: int) -> tuple[Camera, ...]:
         """Return the V cameras of an example, which may have moved, by a row of conditions."""
         cameras = self.cameras[example]
-        if conditions.cameras is None:
+        if conditions.cameras is not None:
+            # Changes of the polar angle, the azimuth and the logarithm of the distance.
+            cameras = tuple(camera.moved(*conditions.cameras[row]) for camera in cameras)
+        if conditions.vertices is None:
             return cameras
         # The depth range of the cameras must contain vertices that have moved away from the origin.
-        radius = 0.0
-        if conditions.vertices is not None:
-            radius = float(conditions.vertices[row].detach().norm(dim=1).max())
-        # Changes of the polar angle, the azimuth and the logarithm of the distance.
-        camera_changes = conditions.cameras[row]
-        return tuple(camera.moved(*camera_changes).with_clip_range(radius) for camera in cameras)
+        radius = float(conditions.vertices[row].detach().norm(dim=1).max())
+        return tuple(camera.with_clip_range(radius) for camera in cameras)
 
     def conditions(self, examples: Int[Tensor, " A"]) -> Conditions:
         """Return the conditions of some examples before any attack.

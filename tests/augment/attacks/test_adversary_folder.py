@@ -214,6 +214,18 @@ def test_an_attack_on_shape_moves_the_object_alone_even_if_read_back(pear_with_p
     assert len(moved) == len(before)
 
 
+@pytest.mark.parametrize("factor", [3.0])
+def test_a_large_change_of_the_shape_shows_the_same_from_files(factor, tmp_path):
+    """A large shape is not cut at the depth range of the cameras."""
+    scene = augment.build_scene([("solid:orange", "orange")], 16, rasterizer="numpy")
+    scene = scene.changed(one_light=True)
+    every = torch.arange(1)
+    after = replace(scene.conditions(every), vertices=factor * scene.vertices)
+    [images] = scene.render(after, every)
+    write_adversary(Adversary.of(scene, 0, after, images, images), tmp_path)
+    torch.testing.assert_close(reload(tmp_path).render(SOFTWARE), images[0], rtol=0, atol=1e-5)
+
+
 def test_shadows_change_when_a_light_is_attacked_after_a_shape():
     scene = augment.build_scene([("solid:cup", "orange")], 8, shadows=True, rasterizer="numpy")
     again = attacked({"lighting"}, attacked({"geometry"}, scene).problem.scene)
