@@ -542,7 +542,9 @@ class DirectRenderer:
         """Find the samples that show an object with given vertices, and their albedo (S, 3)."""
         item = self.objects[object_index]
         shown = (vertices, item.mesh.faces, cameras, settings, self.rasterizer)
-        [fragments] = build_fragments(*shown, item.mesh.closed, at_once=len(cameras))
+        # A large change of the shape can turn faces toward the camera that were seen from behind.
+        is_closed = item.mesh.closed and _moved(item.mesh, vertices).closed
+        [fragments] = build_fragments(*shown, is_closed, at_once=len(cameras))
         fragments = fragments.to(self.like.device)
         albedo = surface_albedo(item.mesh, fragments, settings.encoding)
         return fragments, (albedo * item.albedo_scale).to(self.like)
