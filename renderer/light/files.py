@@ -295,4 +295,8 @@ def _project_map(path: Path, state: tuple[int, ...], degree: int) -> Tensor:
 
     The last result is kept, because scenes load a map with a window and without.
     """
-    return harmonics.project(environment.read_panorama(path), degree)
+    radiance = environment.read_panorama(path)
+    # Harmonics of a high degree vary within a texel of a small map, so its texels are divided.
+    parts = degree // len(radiance) + 1
+    radiance = radiance.repeat_interleave(parts, 0).repeat_interleave(parts, 1)
+    return harmonics.project(radiance, degree)
