@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from renderer import settings as base
-from renderer.errors import MAX_SCALE, InputError, is_number, require_choice, require_range
+from renderer.errors import MAX_SCALE, InputError, is_number, require_choice, require_number
 from renderer.settings import REQUIRED, ImageSettings, Settings, Size, setting, setting_like
 
 # Value of the pixels of a mask or a label map that have no class, as in VOC. They do not count.
@@ -203,7 +203,7 @@ class SceneSettings(Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.adapts_exposure:
-            require_range("exposure", self.exposure, 1 / MAX_SCALE, MAX_SCALE)
+            require_number("exposure", self.exposure, 1 / MAX_SCALE, MAX_SCALE)
         for name, kind in LOCAL_LIGHT_SETTINGS.items():
             if getattr(self, name) is not None:
                 setattr(self, name, base.settings_from(kind, getattr(self, name), name))
