@@ -167,7 +167,7 @@ class _Variation:
         albedo = None
         if settings.lit_background or settings.tables or settings.background_saturation:
             albedo = self._draw_background_albedo()
-            if settings.tables:
+            if self.is_on_table.any():
                 # The light from below is what the table reflects, with the albedo of the image.
                 rows = self.is_on_table
                 mean_albedo = albedo[rows].mean((2, 3))

@@ -255,6 +255,16 @@ def test_a_table_is_as_bright_as_the_exposure_makes_the_object():
     torch.testing.assert_close(darker.backgrounds, 0.25 * given.backgrounds)
 
 
+def test_a_draw_without_a_table_leaves_light_and_backgrounds_as_they_are(scene):
+    """With a small fraction of tables, no example of a few may get one."""
+    varied = drawn(scene, tables=1e-6)
+    torch.testing.assert_close(varied.lights, scene.lights)
+    shown = [
+        each.backgrounds[[row.background for row in each.examples]] for each in (varied, scene)
+    ]
+    torch.testing.assert_close(shown[0], shown[1].expand_as(shown[0]))
+
+
 @pytest.mark.parametrize("options", [{"ground": [0, 0, 0]}, {"views": 2, "shared": True}])
 def test_tables_are_refused_in_scenes_where_they_would_be_wrong(options):
     with pytest.raises(InputError, match=r"^tables"):
