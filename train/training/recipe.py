@@ -142,9 +142,10 @@ def freeze(network: nn.Module, stage: str, size: int) -> None:
         return
     names = [name for name, _ in network.named_parameters()]
     chosen = [name for name in names if name.startswith(f"{stage}.")]
-    if not chosen:
-        examples = nearest(stage, sorted({_module_of(name) for name in names}))
-        raise InputError(f"stage={stage} is no module: choose one, such as {examples}", "stage")
+    if not chosen or chosen[-1] == names[-1]:
+        fault = "leaves no layer that learns" if chosen else "is no module"
+        examples = nearest(stage, sorted({*map(_module_of, names)} - {_module_of(names[-1])}))
+        raise InputError(f"stage={stage} {fault}: choose one, such as {examples}", "stage")
     # All parameters up to the last one of the stage are frozen.
     for parameter in list(network.parameters())[: names.index(chosen[-1]) + 1]:
         parameter.requires_grad_(False)
