@@ -315,7 +315,7 @@ def _evaluate_polynomial(
     # Axes of the product: direction of the derivative, coefficient (those of ∇p first, then the
     # one of a), color. Then one row for each direction and color.
     coefficients = (matrices @ light[: matrices.shape[2]]).mT.flatten(0, 1)
-    even_gradient, linear_gradient = coefficients[:, :-1], coefficients[:, -1:]
+    even, linear_gradient = coefficients[:, :-1], coefficients[:, -1:]
     linear = linear_gradient.view(3, COLORS).T
     # For degree 0, the irradiance is π U_0 Y_0 with the coefficient U_0 of the light and the
     # harmonic Y_0 = 1 / √(4π).
@@ -323,9 +323,7 @@ def _evaluate_polynomial(
     values, gradients = [], []
     for (block,) in split_samples(directions):
         # A tensor of monomials with a name would stay in memory.
-        gradient = torch.addmm(
-            linear_gradient, even_gradient, harmonics.monomials(block, degree - 1)
-        )
+        gradient = torch.addmm(linear_gradient, even, harmonics.monomials(block, degree - 1))
         gradient = gradient.unflatten(0, (3, COLORS))
         # Because p(n) = n · ∇p(n) / d, the irradiance is the sum of two terms: first
         # c + (1 - 1/d) a · n, and then n · (a + ∇p(n)) / d, which the loop adds.

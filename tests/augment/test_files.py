@@ -90,7 +90,7 @@ def test_a_file_of_one_image_whose_outputs_are_not_those_of_each_image_is_refuse
     rows = Structured(lambda x: (x.repeat(5, 2)[:, :4], x.flatten().repeat(2)[:5])).eval()
     path = str(save_exported(rows, tmp_path))
     task = Detection(decode=lambda raw: [{"boxes": raw[0], "scores": raw[1][:, None]}])
-    with pytest.raises(InputError, match="one row for each image.*without suppression"):
+    with pytest.raises(InputError, match=r"one row for each image.*without suppression"):
         load_classifier(path, classes=["a"], size=SIZE, trust_code=True, task=task)
 
 

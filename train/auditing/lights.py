@@ -308,9 +308,7 @@ def success_by_light(
     yield counts
 
 
-def transfer_success(
-    attacked: TaskNetwork, other: TaskNetwork, views: Views
-) -> dict[str, list[int]]:
+def transfer_success(first: TaskNetwork, other: TaskNetwork, views: Views) -> dict[str, list[int]]:
     """Test whether lighting that fools one classifier also fools another classifier.
 
     The attacks continue after their success. The views are rendered again at the image size of the
@@ -321,7 +319,7 @@ def transfer_success(
     """
     counts = {}
     for kind in progress(KINDS, "transfer"):
-        (row,) = transfer(adversaries(attacked, views, kind, additional=True), [other])
+        (row,) = transfer(adversaries(first, views, kind, additional=True), [other])
         # Without a success, there is no lighting to test, and all masks are empty.
         is_tested = np.array(row["clean_correct"], bool)
         masks = (row["success"], is_tested, row["success_without_noise"])

@@ -275,7 +275,7 @@ def test_a_network_that_cannot_learn_in_its_last_layer_is_refused():
 
 def test_a_stage_after_which_no_layer_learns_is_refused():
     network = nn.Sequential(nn.Flatten(), nn.Linear(12, 4), nn.Linear(4, 3))
-    with pytest.raises(InputError, match="stage=2 leaves no layer that learns: .* such as 1$"):
+    with pytest.raises(InputError, match=r"stage=2 leaves no layer that learns: .* such as 1$"):
         recipe.freeze(network, "2", size=2)
 
 
