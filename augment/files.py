@@ -64,7 +64,7 @@ IN_TRAINING_MODE = (
     "was exported in training mode, in which the logits of an image are random or depend on other "
     "images: call eval() before you export it"
 )
-# Module of the class of outputs of transformers, in a graph of such a file.
+# Module of transformers that defines the outputs of a network, in the graph of such a file.
 OUTPUT_MODULE = re.compile(rb'"(transformers\.[\w.]+)\.\w+\\"')
 # Part of the names of their compiled members.
 COMPILED = "/aotinductor/"
@@ -535,10 +535,10 @@ def fill(classifier: Classifier, state: State, source: str | Path) -> Classifier
 
 
 def load_weights(network: nn.Module, state: State) -> None:
-    """Load weights, which need not have the versions of modules, as those of safetensors."""
+    """Load weights, with or without the versions of modules, which safetensors does not store."""
     weights: Any = OrderedDict(state)
-    # MNASNet cannot be loaded without its version. With that of batch normalization, older files
-    # would be refused.
+    # MNASNet cannot be loaded without its version. With the version of batch normalization,
+    # older files would be refused.
     modules = network.named_modules()
     own = {key: {"version": of._version} for key, of in modules if not isinstance(of, _NormBase)}
     weights._metadata = getattr(state, "_metadata", own)

@@ -340,7 +340,7 @@ class ImageSettings(Settings):
         "Use one normal per face (flat) or interpolate the normals of the vertices (smooth).",
         choices=NORMALS,
     )
-    shadows: bool = setting(False, "Cast shadows of the mesh on itself. Needs the extra `shadows`.")
+    shadows: bool = setting(False, "Let the mesh shadow itself. This needs the extra `shadows`.")
     bounces: int = setting(
         0,
         "Number of bounces of light between the surfaces. One or more includes shadows.",

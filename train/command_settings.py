@@ -183,7 +183,7 @@ class LabSettings(Settings):
     environments: list[str] = setting(
         [], "Environment maps (.npy, .hdr, .exr) that light setups of their own."
     )
-    brightness: list[float] = pair([0.2, 2.5], "radiance of white facing the light.", SCALES)
+    brightness: list[float] = pair([0.2, 2.5], "radiance of white surfaces in full light.", SCALES)
     azimuth: list[float] = pair(
         [-70, 70], "azimuth of a projector from the camera.", (-180, 180), "degrees"
     )

@@ -144,7 +144,7 @@ def _write_example(
     # An index would be another class of another network.
     names = result.classifier.classes
     label = names[result.classifier.label(adversary.shown.label)]
-    # An index may be a text that is no name. A label of no class stays.
+    # An index may also be a text. A label that is no class stays as it is.
     name_of: dict[str | int, str] = {str(index): name for index, name in enumerate(names)}
     name_of |= {name: name for name in names} | dict(enumerate(names))
     others = [(name_of.get(of, of), mesh) for of, mesh in adversary.shown.others]

@@ -307,7 +307,7 @@ def read_stl(file: MeshFile) -> list[Part]:
         raise ValueError(_TRUNCATED)
     else:
         if excess >= _STL_FACE.itemsize:
-            file.assume(f"its face count is taken as right, without the last {excess} bytes")
+            file.assume(f"its face count is taken as right and the last {excess} bytes are ignored")
         faces = np.frombuffer(content, _STL_FACE, face_count, _HEADER_SIZE)
         has_colors = bool((faces["attribute"] & 0x8000).any())
         if b"COLOR=" in header:

@@ -136,7 +136,7 @@ class ScoredRun(NamedTuple):
     def pooled(self) -> Pool:
         """Read the predictions."""
         path = self.folder / PREDICTIONS
-        # In one order, the predictions of all runs are paired.
+        # The predictions of all runs are paired, so they are read in one order.
         labels = tuple(sorted(self.scores.labels))
         thresholds = tuple(self.scores.thresholds.items())
         return _pool(path, path.stat().st_mtime_ns, labels, thresholds)
