@@ -209,7 +209,8 @@ def label_loss(
     # Set the logits of the classes that are not shown to -∞. Only the logits of the other
     # classes remain.
     other_logits = logits.scatter(1, classes[:, None], -torch.inf)
-    other_logits[:, list(absent)] = -torch.inf
+    for other in absent:  # A list of indices would be copied to a GPU.
+        other_logits[:, other] = -torch.inf
     # The other classes have the probability Σ exp(other_logits) / Σ exp(logits) = 1 - p.
     complementary = logits.logsumexp(1) - other_logits.logsumexp(1)
     entropy = F.cross_entropy(logits, classes, reduction="none", label_smoothing=label_smoothing)
@@ -223,9 +224,8 @@ def is_correct(predicted: Labels, labels: Labels, absent: Sequence[int] = ()) ->
     −1 − c says that the image does not show class c. It demands a prediction that is neither c
     nor one of the classes `absent`.
     """
-    is_class_of_label = predicted == _class_of(labels)
-    is_absent = torch.isin(predicted, predicted.new_tensor(absent))
-    return torch.where(labels < 0, ~(is_class_of_label | is_absent), is_class_of_label)
+    is_shown = torch.stack([predicted - shown for shown in (_class_of(labels), *absent)]) == 0
+    return torch.where(labels < 0, ~is_shown.any(0), is_shown[0])
 
 
 def _class_of(labels: Tensor) -> Tensor:

@@ -1,0 +1,136 @@
+"""Renders, attacks, transforms and training keep to one GPU, which is pretended."""
+
+from copy import deepcopy
+from dataclasses import replace
+
+import pytest
+import torch
+
+import norm_balls as nb
+from augment.scene.lights import MODELS
+from augment.tasks.classification import is_correct, label_loss
+from renderer.light import skylight
+from tests.pretend_gpu import GpuTensor, pretended_gpu
+from tests.runs import completed_run
+from train.run_folder import read_metrics
+
+STEPS = nb.StepSettings("l2", radius=0.1, step_size=0.02)
+ATTACKS = [
+    {"lighting": STEPS},
+    {"geometry": STEPS},
+    {"pose": nb.PoseSettings()},
+    {"albedo": STEPS},
+    {"pixels": STEPS},
+    {"skylight": nb.SkylightSettings()},
+    {"projector": STEPS},
+    {"lamps": STEPS},
+    {"lighting": STEPS, "optimizer": "random_search", "max_queries": 3},
+    {"lighting": STEPS, "eot": nb.EOTSettings(draws=2, jitter=0.2)},
+]
+RENDERS = [{}, {"normals": "smooth"}, {"gloss": nb.Gloss(0.5)}, {"shadows": True, "bounces": 1}]
+
+
+@pytest.fixture(scope="module")
+def network():
+    return nb.load("none")
+
+
+def test_tensors_of_the_pretended_gpu_do_not_mix_with_others():
+    with pretended_gpu() as waits:
+        here = torch.ones(3, device="cuda", requires_grad=True)
+        with pytest.raises(RuntimeError, match="on one device"):
+            here + torch.ones(3)
+        with pytest.raises(TypeError, match="numpy"):
+            here.detach().numpy()
+        (2 * here.cpu()).sum().backward()
+        assert isinstance(here.grad, GpuTensor)
+        assert here.grad.tolist() == [2, 2, 2]
+        assert waits.total() == 3
+
+
+@pytest.mark.parametrize("silhouettes", [False, True])
+@pytest.mark.parametrize("options", RENDERS, ids=str)
+def test_renders_on_a_gpu_are_those_on_a_cpu(options, silhouettes):
+    mesh, light = nb.solid("cup"), nb.load_light("grace")
+
+    def render(device):
+        vertices = torch.from_numpy(mesh.vertices).to(device).requires_grad_()
+        moved = {"vertices": vertices, "silhouettes": silhouettes}
+        images = nb.render(mesh, nb.orbit_cameras(2, 2.2), light.to(device), 24, **moved, **options)
+        images.square().sum().backward()
+        return images.detach(), vertices.grad
+
+    expected = render("cpu")
+    with pretended_gpu():
+        for on_gpu, on_cpu in zip(render("cuda"), expected, strict=True):
+            assert on_gpu.is_cuda
+            torch.testing.assert_close(on_gpu.cpu(), on_cpu, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("options", ATTACKS, ids=lambda options: next(iter(options)))
+def test_attacks_on_a_gpu_end_as_on_a_cpu(options, network, monkeypatch):
+    fit = skylight._library_fit()
+    monkeypatch.setattr(skylight, "_library_fit", lambda: fit)
+    of_scene = {"silhouettes": True} if "pose" in options or "geometry" in options else {}
+    of_scene |= {"projector": nb.ProjectorSettings()} if "projector" in options else {}
+    of_scene |= {"lamps": nb.LampsSettings([[0, 1.0, 3.0]])} if "lamps" in options else {}
+
+    def attack(network, device):
+        meshes = [("solid:orange:7", "orange")]
+        scene = nb.build_scene(meshes, 32, samples=1, device=device, **of_scene)
+        settings = nb.AttackSettings(**{"max_steps": 1, "margin": 1e3} | options)
+        return nb.attack(network, scene, settings=settings, force=True)
+
+    expected = attack(network, "cpu")
+    with pretended_gpu():
+        found = attack(deepcopy(network).cuda(), "cuda")
+        assert found.success.is_cuda
+        torch.testing.assert_close(found.images.cpu(), expected.images, rtol=0, atol=2e-2)
+
+
+def test_steps_of_an_attack_on_the_lighting_do_not_wait_for_a_gpu(network):
+    """An attack waits every fourth step, to drop finished examples, and in no other step."""
+    settings = nb.AttackSettings(lighting=STEPS, margin=1e3, allow_negative=True)
+    counts = []
+    with pretended_gpu() as waits:
+        on_gpu = deepcopy(network).cuda()
+        scene = nb.build_scene([("solid:orange:7", "orange")], 32, views=2, device="cuda")
+        for steps in (1, 5, 7):  # The first attack builds what the others use again.
+            waits.clear()
+            given = replace(settings, max_steps=steps)
+            nb.attack(on_gpu, scene, settings=given, force=True)
+            counts.append(waits.total())
+    assert counts[1] == counts[2]
+
+
+def test_light_on_images_stays_on_the_gpu(network):
+    images = torch.rand(4, 3, 32, 32)
+    with pretended_gpu():
+        on_gpu, labels = images.cuda(), torch.arange(4).cuda()
+        for name in MODELS:
+            assert nb.RandomLighting(name)(on_gpu).is_cuda
+        assert nb.AdversarialLighting(deepcopy(network).cuda())(on_gpu, labels).is_cuda
+        assert nb.relight_photographs((255 * on_gpu).to(torch.uint8)).is_cuda
+
+
+def test_a_training_on_a_gpu_is_one_on_a_cpu(tiny, tmp_path):
+    overrides = ("model.dropout=0.0", "train.epochs=2")
+    completed_run(tiny(*overrides), tmp_path / "cpu")
+    with pretended_gpu():
+        completed_run(
+            tiny(*overrides, "train.device=cuda", "train.compile=never"), tmp_path / "gpu"
+        )
+    expected, found = (read_metrics(tmp_path / name) for name in ("cpu", "gpu"))
+    for epoch in range(2):
+        loss = pytest.approx(expected[epoch]["train/loss"], rel=1e-3)
+        assert found[epoch]["train/loss"] == loss
+
+
+@pytest.mark.parametrize("absent", [(), (1,)])
+def test_losses_of_labels_do_not_wait_for_a_gpu(absent):
+    with pretended_gpu() as waits:
+        logits, labels = torch.rand(4, 3, device="cuda"), torch.tensor([0, -1, 2, -3]).cuda()
+        waits.clear()
+        label_loss(logits, labels, absent=absent)
+        is_correct(logits.argmax(1), labels, absent)
+    assert waits.total() == 0
