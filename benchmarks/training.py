@@ -16,7 +16,7 @@ without a network.
 meshes, at 32 pixels per side. Each round runs in a process of its own, so that
 the peak memory of the process is that of the round.
 
-`moved` measures rounds of `experiment=best`, in which each render has its own
+`moved` measures rounds of `experiment=patterns`, in which each render has its own
 view and light. They are shaded directly and by operators.
 
 `files` measures `pnb-render` with its defaults, at 224 pixels per side and with
@@ -450,7 +450,7 @@ def measure_moved(options: argparse.Namespace) -> Iterator[Row]:
     meshes = ["solid:orange"] * 10
     settings = train_command.read(
         [
-            "experiment=best",
+            "experiment=patterns",
             "label=orange",
             "network=-",
             "out=-",

@@ -368,7 +368,7 @@ SOLIDS = {
     maker.__name__: maker
     for maker in (orange, apple, pear, sweet_pepper, mushroom, bottle, cup, plate, lamp, table)
 }
-# Solids that resemble an orange. The training run `experiment=best` shows the network the solid
+# Solids that resemble an orange. The training run `experiment=patterns` shows the network the solid
 # `fruit` in training, and the other three solids in its evaluation.
 HARD_NEGATIVES = {maker.__name__: maker for maker in (lemon, peach, ball, fruit)}
 

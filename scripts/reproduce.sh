@@ -5,14 +5,14 @@ set -euo pipefail
 
 usage() {
     cat >&2 <<'END'
-usage: DATA=cifar100.npz MESHES='[orange.glb]' PHOTOS=photos scripts/reproduce.sh gpu|cpu|harden|best [key=value ...]
+usage: DATA=cifar100.npz MESHES='[orange.glb]' PHOTOS=photos scripts/reproduce.sh gpu|cpu|harden|patterns [key=value ...]
 
 Run it in the root of the clone.
-  gpu     training speed, and the experiments paper and fast, with five seeds
-  cpu     training speed, and the experiment cpu, with five seeds
-  harden  the experiment harden from a network: four methods with three seeds
-  best    the experiment best, alone and with TrivialAugment, and six methods
-          without renders, with three seeds
+  gpu       training speed, and the experiments paper and fast, with five seeds
+  cpu       training speed, and the experiment cpu, with five seeds
+  harden    the experiment harden from a network: four methods with three seeds
+  patterns  the experiment patterns, alone and with TrivialAugment, and six methods
+            without renders, with three seeds
 
 Every training run gets the further settings key=value of pnb-train.
 
@@ -20,8 +20,8 @@ These are read from the environment:
   DATA      CIFAR-100, as data=npz reads it
   MESHES    meshes, a list
   PHOTOS    a folder of photographs on which the networks are scored
-  LAB       harden, best: a folder that pnb-lab wrote
-  BASE      harden, best: the network to start from; default pretrained/none
+  LAB       harden, patterns: a folder that pnb-lab wrote
+  BASE      harden, patterns: the network to start from; default pretrained/none
   DISTANCE  harden: L2 norm of the random perturbations of the fourth method. It is
             the norm of the adversarial perturbations; default 0.6
   RUNS      folder of the runs; default runs/reproduce
@@ -64,7 +64,7 @@ cpu)
     device=cpu
     experiments=(cpu)
     ;;
-harden | best) [[ -n ${LAB:-} ]] || usage ;;
+harden | patterns) [[ -n ${LAB:-} ]] || usage ;;
 *) usage ;;
 esac
 shift
@@ -80,19 +80,19 @@ gpu | cpu)
     done
     exit
     ;;
-best)
-    sweep best "${from_network[@]}" "$@"
-    sweep best train.augmentation=trivial_augment "${from_network[@]}" "$@"
+patterns)
+    sweep patterns "${from_network[@]}" "$@"
+    sweep patterns train.augmentation=trivial_augment "${from_network[@]}" "$@"
     # The baselines have no renders, but the same network, images, model soup and
-    # seeds. To train for about as many minutes as best, the method without
+    # seeds. To train for about as many minutes as patterns, the method without
     # augmentation gets twice the images. PGD takes three additional passes for
     # each image, and gets half of the images.
     without_renders=(augment=none train.ranking_weight=0)
-    sweep best "${without_renders[@]}" \
+    sweep patterns "${without_renders[@]}" \
         train.augmentation=none,color_jitter,trivial_augment,augmix "${from_network[@]}" "$@"
-    sweep best "${without_renders[@]}" train.augmentation=none train.images_per_epoch=48000 \
+    sweep patterns "${without_renders[@]}" train.augmentation=none train.images_per_epoch=48000 \
         "${from_network[@]}" "$@"
-    sweep best "${without_renders[@]}" train.augmentation=pgd train.images_per_epoch=12000 \
+    sweep patterns "${without_renders[@]}" train.augmentation=pgd train.images_per_epoch=12000 \
         "${from_network[@]}" "$@"
     ;;
 harden)

@@ -62,7 +62,7 @@ def test_missing_inputs_are_refused_before_anything_runs(tmp_path, arguments, en
         ("cpu", ["cpu"], ["cpu"]),
         ("gpu", ["paper", "fast"], ["paper", "fast"]),
         ("harden", ["harden"] * 2, ["harden"]),
-        ("best", ["best"] * 5, ["best"]),
+        ("patterns", ["patterns"] * 5, ["patterns"]),
     ],
 )
 def test_every_training_has_valid_settings_and_tables_compare_all_runs_of_an_experiment(
@@ -77,7 +77,7 @@ def test_every_training_has_valid_settings_and_tables_compare_all_runs_of_an_exp
         assert settings.data.path == "cifar100.npz"
         assert settings.train.checkpoint_every == 5
         assert settings.meshes == ["a.glb", {"mesh": "b.glb", "albedo_scale": 3.0}]
-        is_from_network = command in ("harden", "best")
+        is_from_network = command in ("harden", "patterns")
         folders = ["photographs", "laboratory"] if is_from_network else ["photographs"]
         assert [*settings.scored_folders] == folders
     compared = [call for call in calls if call[:2] == ["-m", "scripts.compare"]]

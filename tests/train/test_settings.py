@@ -18,7 +18,7 @@ from train.system import user_message
 
 OTHER_DATA = ["data=npz", "data.path=a.npz", "out=here"]
 EXPERIMENTS = ["best", "classifier", "cpu", "demo", "dim", "fast", "harden", "low_light", "paper"]
-EXPERIMENTS += ["photographs", "stripes"]
+EXPERIMENTS += ["patterns", "photographs", "stripes"]
 
 
 CLASSIFIER = ["experiment=classifier", "network=b", "unlabeled=c"]

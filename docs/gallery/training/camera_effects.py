@@ -2,8 +2,8 @@
 Effects of a camera
 ===================
 
-Hardening with ``experiment=best`` adds projected patterns, white balance, blur and noise to the
-renders.
+Hardening with ``experiment=patterns`` adds projected patterns, white balance, blur and noise to
+the renders.
 """
 
 import matplotlib.pyplot as plt
