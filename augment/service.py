@@ -109,6 +109,8 @@ class AugmentationService:
         self.positive_classes = as_integers("positive_classes", self.positive_classes).tolist()
         if self.scene is not None:
             require_shape("labels", self.labels, len(self.scene))
+            if self.scene.views > 1:
+                raise InputError("scene has examples of several views: build it with shared=False")
         if self._finds_objects and self.settings.mode == "folder":
             reason = f"mode=folder has images without boxes, but the task is {self.task.name}"
             raise InputError(f"{reason}: choose random or adversarial")

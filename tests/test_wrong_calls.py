@@ -383,6 +383,7 @@ SERVICES = [
     ),
     *calls_of("meshes", lambda x: of_meshes(x, SIZE), [(MESH,)], [MESH], 3),
     *calls_of("label", small_service, "orange", 1.5, None),
+    *calls_of("shared", lambda x: small_service(views=2, shared=x), True),
     *calls_of("size", lambda x: of_meshes([(MESH, 0)], x), 16.5, 0),
     *by_name(small_service, settings=[{"mode": "random"}], seed=["x", 1.5, -1]),
     *calls_of("label", lambda x: small_service(x).regenerate(LINEAR, 0), 2),
