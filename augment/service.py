@@ -324,7 +324,7 @@ class AugmentationService:
         if stored is None or not torch.equal(torch.as_tensor(stored).cpu(), self._scene_hash):
             advice = "resume with the same meshes, labels, views and light"
             raise InputError(f"state is of another scene, or not of a service: {advice}")
-        values = state.get("values")
+        values = state.get("values") if self.settings.warm_start else None
         if values is not None and self.scene is not None:
             start = build_problem(self.settings.attack, self.scene).start
             require_shape("state['values']", values, *start.shape)

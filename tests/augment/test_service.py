@@ -245,6 +245,14 @@ def test_the_state_of_another_attack_is_refused_when_it_is_loaded(serve, model):
         other.load_state_dict(service.state_dict())
 
 
+def test_a_service_that_always_starts_again_leaves_the_last_attack_of_a_state(serve, model):
+    warm, resumed = serve(warm_start=True), serve()
+    warm.regenerate(model, 0)
+    resumed.load_state_dict(warm.state_dict())
+    images = serve().regenerate(model, 1).images
+    assert torch.equal(resumed.regenerate(model, 1).images, images)
+
+
 def test_a_warm_start_in_another_environment_lies_in_the_ball_around_it(serve):
     """Every example is misclassified as class 1, so that no step projects its values."""
     vary = VariationSettings(environments=["grace", "eucalyptus", "st_peters"])
