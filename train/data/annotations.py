@@ -301,7 +301,9 @@ def _search_images(
         # Images of this name, by the number of equal parts at the end of their paths.
         by_equal_parts: dict[int, list[Path]] = defaultdict(list)
         for image in others[parts[-1]]:
-            by_equal_parts[_equal_ends(Path(form(str(image))).parts, parts)].append(image)
+            pairs = zip(reversed(Path(form(str(image))).parts), reversed(parts), strict=False)
+            equal_parts = [*takewhile(lambda pair: pair[0] == pair[1], pairs)]
+            by_equal_parts[len(equal_parts)].append(image)
         most = max(by_equal_parts, default=0)
         # An image in another folder may be any of several that have its name.
         if most == 1 and uses[parts[-1]] > 1:
@@ -313,12 +315,6 @@ def _search_images(
         if images:
             found[name] = images[0]
     return found
-
-
-def _equal_ends(*parts: Sequence[str]) -> int:
-    """Count the equal parts at the ends of two paths."""
-    pairs = zip(*(reversed(each) for each in parts), strict=False)
-    return len([*takewhile(lambda pair: pair[0] == pair[1], pairs)])
 
 
 def _read_yolo(folder: Path, file: Path | None = None) -> Annotations:
