@@ -14,7 +14,7 @@ minimizes the error of the irradiance, Σ A_l² (x − v)², with the factors A_
 nearest one is chosen. If negative minima are left after some solutions, the light times
 `nonnegative_window` is mixed in to remove them. This windowed light is non-negative if the
 given light is a physical light that was cut off at a degree. Above degree
-_COARSE_GRID_DEGREE, the program would take long, and the window alone is used. Without a
+_PROGRAM_DEGREE, the program would take long, and the window alone is used. Without a
 fixed mean, the nearest coefficients would brighten the whole sky to remove the negative
 minima beside a bright source.
 
@@ -90,12 +90,14 @@ _RADIUS_TOLERANCE = 1e-7
 _MAX_RADIUS_STEPS = 10
 # Smallest denominator of divisions in this module. It avoids a division by 0.
 _TINY = 1e-300
+# Above this degree, `project_nonnegative` uses the window alone.
+_PROGRAM_DEGREE = 10
 # Negative radiance is searched at the vertices of an icosphere. For lights up to degree
 # _COARSE_GRID_DEGREE, the icosphere has _COARSE_SUBDIVISIONS, and neighboring vertices are
 # 0.07 radians apart. For other lights, it has _FINE_SUBDIVISIONS and half this distance.
 _COARSE_SUBDIVISIONS = 4
 _FINE_SUBDIVISIONS = 5
-_COARSE_GRID_DEGREE = 10
+_COARSE_GRID_DEGREE = 6
 # Longest step on the unit sphere, in radians, in the search for a minimum of the radiance.
 _MAX_ANGLE = 0.1
 # Number of Newton steps from a vertex of the icosphere to a local minimum of the radiance
@@ -119,9 +121,9 @@ def project_nonnegative(coefficients: Tensor) -> Tensor:
     channels of a light are projected separately, in float64. The result has no
     gradient. The radiance is at least -`TOLERANCE` times the largest one of the channel. The
     first coefficient stays, or becomes 0 if it was negative. A channel without negative radiance
-    is unchanged. Above degree _COARSE_GRID_DEGREE, the highest degrees stay zero if all are.
+    is unchanged. Above degree _PROGRAM_DEGREE, the highest degrees stay zero if all are.
     """
-    low = (_COARSE_GRID_DEGREE + 1) ** 2
+    low = (_PROGRAM_DEGREE + 1) ** 2
     if coefficients.shape[-2] > low and not coefficients[..., low:, :].any():
         projected = project_nonnegative(coefficients[..., :low, :])
         return F.pad(projected, (0, 0, 0, coefficients.shape[-2] - low))
@@ -154,7 +156,7 @@ def _project_channel(channel: bytes) -> Array:
         return uniform
     degree = math.isqrt(len(light)) - 1
     nearest = light
-    if degree <= _COARSE_GRID_DEGREE:
+    if degree <= _PROGRAM_DEGREE:
         # Only the mean, which is the first coefficient, is bounded.
         low = np.concatenate([[mean], np.full(len(light) - 1, -np.inf)])
         high = np.where(low == mean, mean, np.inf)
@@ -166,8 +168,10 @@ def _project_channel(channel: bytes) -> Array:
     # Harmonics in the directions in which the radiance must not be negative, one row
     # for each direction.
     constraints = _grid(degree, _COARSE_SUBDIVISIONS)[1].T
+    # The window leaves few minima, and lights of low degrees have few.
+    starts = _MANY_STARTS if _COARSE_GRID_DEGREE < degree <= _PROGRAM_DEGREE else _LOWEST_STARTS
     for _ in range(_MAX_ROUNDS):
-        _, new_constraints = _find_negative_minima(nearest[None], rounding_radiance, _LOWEST_STARTS)
+        _, new_constraints = _find_negative_minima(nearest[None], rounding_radiance, starts)
         if not len(new_constraints):
             break
         # Mix uniform light into the windowed light until its radiance is not negative in

@@ -198,6 +198,15 @@ def test_physical_light_keeps_the_mean_and_no_window_has_a_smaller_error(name, d
     require_physical(concentrated_light(name, degree), degree)
 
 
+@both_projections
+def test_random_light_of_degree_9_is_nowhere_negative(projection):
+    light = draw(100, 6, seed=5)
+    light[0] = 6
+    directions, _ = quadrature(200)
+    radiance = basis(directions, 9) @ projection(light)
+    assert (radiance.amin(0) >= -TOLERANCE * radiance.amax(0)).all()
+
+
 def test_light_of_degree_2_is_closer_to_a_physical_one_with_more_degrees():
     """An attack on gloss gives degree 39 to light of degree 2."""
     given = concentrated_light("lamps", 2)
