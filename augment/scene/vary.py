@@ -15,6 +15,7 @@ from torch import Generator, Tensor
 from augment.augmentation_settings import CameraEffectSettings, VariationSettings
 from augment.progress import progress
 from augment.scene import patterns
+from augment.scene.build import reached_gloss
 from augment.scene.objects import (
     Example,
     SceneObject,
@@ -201,7 +202,9 @@ class _Variation:
         environment = scene.lights[:, : harmonics.size]
         if settings.environments:
             chosen = torch.randint(len(settings.environments), (count,), generator=self.draws)
-            loaded = [load_light(light, harmonics.degree) for light in settings.environments]
+            # Highlights on glossy objects get no dark rings.
+            fitting = harmonics.degree, reached_gloss(scene.objects).gloss_roughness
+            loaded = [load_light(light, *fitting) for light in settings.environments]
             environment = torch.stack(loaded)[chosen].to(scene.lights)
         if not settings.directional_fraction:
             return environment, torch.zeros(count, 3, dtype=torch.float64)

@@ -33,7 +33,7 @@ from augment.classifier import TaskNetwork
 from augment.network import compute_outputs, device_of
 from augment.progress import progress
 from augment.random_streams import generator
-from augment.scene.build import build_lights
+from augment.scene.build import build_lights, reached_gloss
 from augment.scene.objects import Conditions, SceneObject
 from augment.scene.scene import Scene
 from augment.scene.truth import NO_OBJECT, Truth
@@ -193,7 +193,8 @@ def environment_lights(views: Views, environments: Sequence[str], random_count: 
     noise = generator(views.seed, "lights")
     center = load_light(LIGHT)
     random_lights = perturb(center, random_count, AMPLITUDE, radius=None, generator=noise)
-    lights = {Path(name).stem: load_light(name) for name in environments}
+    gloss = reached_gloss(views.objects).gloss_roughness
+    lights = {Path(name).stem: load_light(name, roughness=gloss) for name in environments}
     for number, light in enumerate(HARMONICS.project_nonnegative(random_lights), 1):
         lights[f"{RANDOM}{number}"] = light
     return {name: views.exposure * light.to(views.device) for name, light in lights.items()}

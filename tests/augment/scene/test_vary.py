@@ -217,6 +217,17 @@ def test_light_of_probes_varies_alike_in_every_degree(degree_6_and_9):
     torch.testing.assert_close(images_of(high), images_of(low), rtol=0, atol=1e-5)
 
 
+@pytest.mark.filterwarnings("ignore:.*blurs its highlights")
+def test_a_map_makes_no_dark_rings_on_gloss(tmp_path):
+    lamp = np.full((16, 32, 3), 0.01, dtype=np.float32)
+    lamp[4, 16] = 100
+    path = str(tmp_path / "lamp.npy")
+    np.save(path, lamp)
+    glossy = ObjectSettings("solid:pear", label="pear", gloss=[0.4])
+    scene = augment.build_scene([glossy], 8, light=path, samples=1)
+    assert torch.equal(drawn(scene, environments=[path]).lights, scene.lights)
+
+
 def test_an_environment_beyond_the_degree_of_the_scene_is_refused(degree_6_and_9, tmp_path):
     low, high = degree_6_and_9
     light = high.lights[0].clone()

@@ -61,6 +61,15 @@ def mean_values(views: lights.Views, power: float | None = None) -> torch.Tensor
     return images.mean((1, 2, 3, 4))
 
 
+def test_a_map_makes_no_dark_rings_on_gloss(tmp_path):
+    path = tmp_path / "lamp.npy"
+    np.save(path, np.float32(np.arange(16 * 32) == 144).reshape(16, 32, 1).repeat(3, axis=2))
+    glossy = load_object(ObjectSettings("solid:orange:0", label="orange", gloss=[0.4]))
+    views = lights.Views([glossy], 1, 0, torch.device("cpu"))
+    shown = lights.environment_lights(views, [str(path)], 1)["lamp"]
+    torch.testing.assert_close(shown, load_light(path, roughness=0.4))
+
+
 def test_attacks_within_a_radius_succeed_where_the_brightest_lamps_do(views, tmp_path, monkeypatch):
     """Each lamp adds light, so no light within a radius is brighter than all lamps at it."""
     # Steps of a quarter of the radius reach a corner of the norm-ball in four.
