@@ -224,7 +224,7 @@ def is_correct(predicted: Labels, labels: Labels, absent: Sequence[int] = ()) ->
     −1 − c says that the image does not show class c. It demands a prediction that is neither c
     nor one of the classes `absent`.
     """
-    is_shown = torch.stack([predicted - shown for shown in (_class_of(labels), *absent)]) == 0
+    is_shown = torch.stack([predicted.eq(_class_of(labels)), *map(predicted.eq, absent)])
     return torch.where(labels < 0, ~is_shown.any(0), is_shown[0])
 
 
