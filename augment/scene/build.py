@@ -464,7 +464,11 @@ def expose(scene: Scene) -> Scene:
     for index, item in enumerate(scene.objects):
         rows = scene.rows_of(index)
         # At most `PROBED` examples at equal distances. -(-a // b) divides and rounds up.
-        probe = _probe(scene, rows[:: -(-len(rows) // PROBED)])
+        rows = rows[:: -(-len(rows) // PROBED)]
+        shown = {"examples": [scene.examples[row] for row in rows], "lights": scene.lights[rows]}
+        # Before black. Transfer operators would be built for light that never changes.
+        black = torch.zeros_like(scene.backgrounds)
+        probe = scene.changed(**shown, backgrounds=black, camera_effects=None, one_light=True)
         # Light of projector and lamps, which the exposure leaves as it is.
         local = _linear_values(probe, 0.0) if scene.basis.local_lights else torch.zeros(1)
         values = _linear_values(probe, 1.0) - local
@@ -488,18 +492,6 @@ def expose(scene: Scene) -> Scene:
         say_once(said)
     exposures = [each.exposure * factors[each.object] for each in scene.examples]
     return scene.changed(examples=placed.with_field(scene.examples, "exposure", exposures))
-
-
-def _probe(scene: Scene, rows: list[int]) -> Scene:
-    """Return a scene of some examples before black."""
-    # Direct rendering: transfer operators would be built for light that never changes.
-    return scene.changed(
-        examples=[scene.examples[row] for row in rows],
-        lights=scene.lights[rows],
-        backgrounds=torch.zeros_like(scene.backgrounds),
-        camera_effects=None,
-        one_light=True,
-    )
 
 
 def _linear_values(probe: Scene, factor: float) -> Float[Tensor, "N 3"]:
