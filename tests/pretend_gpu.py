@@ -1,13 +1,13 @@
 """A pretended GPU: tensors that say `cuda:0`, compute on the CPU, and do not mix with others.
 
-Most faults of code for a GPU are tensors on the wrong device, and steps that wait for the GPU. Both
-are found without one. Kernels, memory and times of a GPU are not tested.
+Tensors on the wrong device and steps that wait for a GPU are found without one. Kernels, memory and
+times of a GPU are not tested.
 """
 
 import sys
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock, patch
@@ -19,15 +19,15 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
 GPU, CPU = torch.device("cuda", 0), torch.device("cpu")
-MIXING = {torch.ops.aten.copy_, torch.ops.aten._to_copy}
-INDEXING = {torch.ops.aten.index, torch.ops.aten.index_put, torch.ops.aten.index_put_}
-INDEXING |= {torch.ops.aten._index_put_impl_}
-READING = {torch.ops.aten._local_scalar_dense, torch.ops.aten.nonzero}
+aten = torch.ops.aten
+INDEXING = {aten.index, aten.index_put, aten.index_put_, aten._index_put_impl_}
+# Functions of torch.cuda that do nothing here.
 DRIVER_CALLS = (
     *("synchronize", "empty_cache", "set_device", "manual_seed", "manual_seed_all", "_lazy_init"),
     *("set_rng_state", "set_rng_state_all", "reset_peak_memory_stats"),
 )
-ROOT = Path(__file__).parents[1]
+# The packages whose lines are counted.
+OWN = tuple(f"{Path(__file__).parents[1] / name}/" for name in ("renderer", "augment", "train"))
 
 
 class GpuTensor(Tensor):
@@ -82,8 +82,8 @@ class _Move(torch.autograd.Function):
     @staticmethod
     def forward(context, tensor, dtype, device):
         context.tensor = tensor
-        _state.is_move = True
-        return torch.ops.aten._to_copy(tensor, dtype=dtype, device=device)
+        copied = aten._to_copy(_held(tensor), dtype=dtype)
+        return GpuTensor(copied) if device.type == "cuda" else copied
 
     @staticmethod
     def backward(context, gradient):
@@ -91,11 +91,15 @@ class _Move(torch.autograd.Function):
         return moved, None, None
 
 
+def _held(leaf):
+    return leaf.held if isinstance(leaf, GpuTensor) else leaf
+
+
 def _move(tensor, dtype, device, waits):
     device = tensor.device if device is None else torch.device(device)
     dtype = dtype or tensor.dtype
     if device.type == tensor.device.type:
-        return tensor if dtype == tensor.dtype else torch.ops.aten._to_copy(tensor, dtype=dtype)
+        return tensor if dtype == tensor.dtype else aten._to_copy(tensor, dtype=dtype)
     if waits:
         _wait()
     return _Move.apply(tensor, dtype, device)
@@ -104,14 +108,18 @@ def _move(tensor, dtype, device, waits):
 def _wait() -> None:
     """Note the line of the project that waits for the GPU."""
     frame = sys._getframe(1)
-    while frame.f_back and not _is_own(frame.f_code.co_filename):
+    while frame.f_back and not frame.f_code.co_filename.startswith(OWN):
         frame = frame.f_back
     _state.waits[f"{Path(frame.f_code.co_filename).name}:{frame.f_lineno}"] += 1
 
 
-def _is_own(name: str) -> bool:
-    folders = [ROOT / folder for folder in ("renderer", "augment", "train")]
-    return any(folder in Path(name).parents for folder in folders)
+def is_read(function, arguments) -> bool:
+    """Return whether a CPU waits for the result of an operation on a GPU."""
+    kind = function.overloadpacket
+    if kind in INDEXING:
+        indices = [leaf for leaf in tree_leaves(arguments[1]) if isinstance(leaf, Tensor)]
+        return any(index.dtype == torch.bool for index in indices)
+    return kind in (aten._local_scalar_dense, aten.nonzero)
 
 
 def _dispatched(function, arguments, options):
@@ -121,33 +129,26 @@ def _dispatched(function, arguments, options):
     is_on_gpu = [isinstance(tensor, GpuTensor) for tensor in tensors]
     given = options.get("device")
     is_gpu = any(is_on_gpu)
-    if is_gpu and not all(is_on_gpu) and kind not in MIXING:
+    if is_gpu and not all(is_on_gpu) and kind not in (aten.copy_, aten._to_copy):
         mixed = [x for x, on_gpu in zip(tensors, is_on_gpu, strict=True) if not on_gpu and x.dim()]
         # Indices on the CPU may select from a tensor on the GPU, but not the other way around.
         if mixed and not (kind in INDEXING and is_on_gpu[0]):
             raise RuntimeError(f"{function}: all tensors must be on one device, not cuda:0 and cpu")
-        if mixed and any(index.numel() for index in mixed):
+        if any(index.numel() for index in mixed):
             _wait()
-    indices = [x for x in tree_leaves(arguments[1:2]) if kind in INDEXING and x is not None]
-    is_masked = any(index.dtype == torch.bool for index in indices)
-    if is_gpu and (kind in READING or is_masked):
+    if is_gpu and is_read(function, arguments):
         _wait()
-    held_arguments, held_options = tree_map(
-        lambda leaf: leaf.held if isinstance(leaf, GpuTensor) else leaf, (arguments, options)
-    )
+    held_arguments, held_options = tree_map(_held, (arguments, options))
     if given is not None:
         held_options["device"] = CPU
     held_options.pop("pin_memory", None)
     result = function(*held_arguments, **held_options)
-    if kind is torch.ops.aten._to_copy:
-        # Other copies are those of PyTorch, which takes both devices for the CPU.
-        is_gpu = torch.device(given).type == "cuda" if _state.is_move else is_gpu
-        _state.is_move = False
-    elif kind is torch.ops.aten.copy_:
+    if kind is aten.copy_:
         is_gpu = is_on_gpu[0]
-    elif kind is torch.ops.aten._local_scalar_dense:
+    elif kind is aten._local_scalar_dense:
         return result
-    elif given is not None and not (tensors and _state.depth):
+    # `_Functions` moves tensors, so that other copies stay on their device.
+    elif kind is not aten._to_copy and given is not None and not (tensors and _state.depth):
         is_gpu = bool(_state.depth) or torch.device(given).type == "cuda"
     if not is_gpu:
         return result
@@ -163,7 +164,7 @@ def _dispatched(function, arguments, options):
 
 
 class _Functions(TorchFunctionMode):
-    """Runs functions of PyTorch that name a device, and marks the others on the GPU."""
+    """Moves tensors where a function names a device. Other functions keep their results there."""
 
     def __torch_function__(self, function, types, arguments=(), options=None):
         options = options or {}
@@ -186,8 +187,7 @@ class _Functions(TorchFunctionMode):
         if is_backward or not any(isinstance(leaf, GpuTensor) for leaf in leaves):
             return function(*arguments, **options)
         # What a function of C++ makes from a tensor of the GPU is on the GPU.
-        is_explicit = options.get("device") is not None
-        with _inheriting() if not is_explicit else ExitStack():
+        with nullcontext() if options.get("device") is not None else _inheriting():
             return function(*arguments, **options)
 
 
@@ -205,12 +205,15 @@ def _to(function, tensor, *arguments, non_blocking=False, copy=False, **options)
 
 
 class _Operations(TorchDispatchMode):
+    """Runs operations that get no tensor of the GPU, such as those that make one."""
+
     def __torch_dispatch__(self, function, types, arguments=(), options=None):
         return _dispatched(function, arguments, options or {})
 
 
 @contextmanager
 def _inheriting() -> Iterator[None]:
+    """Let new tensors be on the GPU, because what they are made from is there."""
     _state.depth += 1
     try:
         yield
@@ -232,6 +235,8 @@ _Seeded = torch.Generator
 
 
 class _Generator(_Seeded):
+    """A generator of random numbers that takes the name of any device."""
+
     def __new__(cls, device="cpu"):
         made = _Seeded.__new__(cls, "cpu")
         made.pretended = torch.device(device)
@@ -240,12 +245,13 @@ class _Generator(_Seeded):
     device = property(lambda self: self.pretended)
 
 
-_state = SimpleNamespace(waits=Counter(), depth=0, is_move=False)
+# Waits by lines, and the number of nested functions whose results are on the GPU.
+_state = SimpleNamespace(waits=Counter(), depth=0)
 
 
 @contextmanager
 def pretended_gpu() -> Iterator[Counter[str]]:
-    """Pretend that there is a GPU. Yields a count of the waits for it by lines of the project."""
+    """Pretend that there is a GPU, and yield the number of waits for it at each line."""
     memory = (8 << 30, 8 << 30)
     facts = SimpleNamespace(total_memory=memory[1], name="pretended GPU", major=9, minor=0)
     answers = {"is_available": True, "is_initialized": True, "device_count": 1, "current_device": 0}
@@ -255,7 +261,7 @@ def pretended_gpu() -> Iterator[Counter[str]]:
     answers |= {"get_rng_state": torch.zeros(16, dtype=torch.uint8)}
     answers |= dict.fromkeys(DRIVER_CALLS)
     stream = MagicMock()
-    stream.record_event().elapsed_time.return_value = 1.0
+    stream.record_event.return_value.elapsed_time.return_value = 1.0
     calls = {name: lambda *_, _value=value, **__: _value for name, value in answers.items()}
     calls |= {"current_stream": lambda *_: stream}
     _state.waits = Counter()
