@@ -462,11 +462,11 @@ def expose(scene: Scene) -> Scene:
     """Choose the exposure of each object at which its pixels have the mean MEAN, and say it."""
     factors = []
     for index, item in enumerate(scene.objects):
-        rows = scene.rows_of(index)
+        all_rows = scene.rows_of(index)
         # At most `PROBED` examples at equal distances. -(-a // b) divides and rounds up.
-        rows = rows[:: -(-len(rows) // PROBED)]
+        rows = all_rows[:: -(-len(all_rows) // PROBED)]
         shown = {"examples": [scene.examples[row] for row in rows], "lights": scene.lights[rows]}
-        # Before black. Transfer operators would be built for light that never changes.
+        # Black lies behind them. Transfer operators would be built for light that never changes.
         black = torch.zeros_like(scene.backgrounds)
         probe = scene.changed(**shown, backgrounds=black, camera_effects=None, one_light=True)
         # Light of projector and lamps, which the exposure leaves as it is.

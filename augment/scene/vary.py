@@ -202,10 +202,10 @@ class _Variation:
         environment = scene.lights[:, : harmonics.size]
         if settings.environments:
             chosen = torch.randint(len(settings.environments), (count,), generator=self.draws)
-            # Highlights on glossy objects get no dark rings.
-            fitting = harmonics.degree, reached_gloss(scene.objects).gloss_roughness
-            loaded = [load_light(light, *fitting) for light in settings.environments]
-            environment = torch.stack(loaded)[chosen].to(scene.lights)
+            # With the roughness, highlights on glossy objects get no dark rings.
+            roughness = reached_gloss(scene.objects).gloss_roughness
+            maps = [load_light(name, harmonics.degree, roughness) for name in settings.environments]
+            environment = torch.stack(maps)[chosen].to(scene.lights)
         if not settings.directional_fraction:
             return environment, torch.zeros(count, 3, dtype=torch.float64)
         # Factor by which the environment of an example with a directional light is dimmed.

@@ -209,7 +209,8 @@ def label_loss(
     # Set the logits of the classes that are not shown to -∞. Only the logits of the other
     # classes remain.
     other_logits = logits.scatter(1, classes[:, None], -torch.inf)
-    for other in absent:  # A list of indices would be copied to a GPU.
+    # A list of indices would be copied to a GPU in each step.
+    for other in absent:
         other_logits[:, other] = -torch.inf
     # The other classes have the probability Σ exp(other_logits) / Σ exp(logits) = 1 - p.
     complementary = logits.logsumexp(1) - other_logits.logsumexp(1)
@@ -224,8 +225,9 @@ def is_correct(predicted: Labels, labels: Labels, absent: Sequence[int] = ()) ->
     −1 − c says that the image does not show class c. It demands a prediction that is neither c
     nor one of the classes `absent`.
     """
-    is_shown = torch.stack([predicted.eq(_class_of(labels)), *map(predicted.eq, absent)])
-    return torch.where(labels < 0, ~is_shown.any(0), is_shown[0])
+    # The first row compares with the class of the label, and each other row with an absent class.
+    is_equal = torch.stack([predicted.eq(_class_of(labels)), *map(predicted.eq, absent)])
+    return torch.where(labels < 0, ~is_equal.any(0), is_equal[0])
 
 
 def _class_of(labels: Tensor) -> Tensor:

@@ -168,7 +168,7 @@ def _project_channel(channel: bytes) -> Array:
     # Harmonics in the directions in which the radiance must not be negative, one row
     # for each direction.
     constraints = _grid(degree, _COARSE_SUBDIVISIONS)[1].T
-    # The window leaves few minima, and lights of low degrees have few.
+    # Lights of low degrees have few minima, and the window alone leaves few.
     starts = _MANY_STARTS if _COARSE_GRID_DEGREE < degree <= _PROGRAM_DEGREE else _LOWEST_STARTS
     for _ in range(_MAX_ROUNDS):
         _, new_constraints = _find_negative_minima(nearest[None], rounding_radiance, starts)

@@ -193,8 +193,8 @@ def environment_lights(views: Views, environments: Sequence[str], random_count: 
     noise = generator(views.seed, "lights")
     center = load_light(LIGHT)
     random_lights = perturb(center, random_count, AMPLITUDE, radius=None, generator=noise)
-    gloss = reached_gloss(views.objects).gloss_roughness
-    lights = {Path(name).stem: load_light(name, roughness=gloss) for name in environments}
+    roughness = reached_gloss(views.objects).gloss_roughness
+    lights = {Path(name).stem: load_light(name, roughness=roughness) for name in environments}
     for number, light in enumerate(HARMONICS.project_nonnegative(random_lights), 1):
         lights[f"{RANDOM}{number}"] = light
     return {name: views.exposure * light.to(views.device) for name, light in lights.items()}

@@ -23,11 +23,13 @@ OF_AUDIT = ("*/recognized.json", f"*/*/{RELIT}")
 OF_RUN = (METRICS, run_folder.LAST, run_folder.PREVIOUS, run_folder.BEST, run_folder.WEIGHTS)
 # Files that commands write to their output folders. A command refuses a folder with one of them.
 RESULTS = (
-    *(*OF_RUN, *OF_AUDIT, run_folder.PUBLISHED, photo.DESCRIPTION, photo.TABLE, CONFIG, PAGE),
+    *OF_RUN,
+    *OF_AUDIT,
     *(RELIT, f"*/{LINES}", LINES, "adversary.json", SWEEP_TABLE, SWEEP_FIGURE),
     *(SUMMARY, predictions.PREDICTIONS, predictions.CONTACT_SHEET),
     *(predictions.ROC_TABLE, predictions.ROC_FIGURE),
     *("light.json", "background.png", "comparison.png"),
+    *(photo.DESCRIPTION, photo.TABLE, run_folder.PUBLISHED, CONFIG, PAGE),
 )
 
 
