@@ -479,12 +479,16 @@ def _as_scalar(name: str, value: Any) -> Any:
 
 def _like(array: np.ndarray, points: Points) -> Points:
     """Convert an array to a tensor on the device of the points, if they are one."""
-    return points.new_tensor(array) if isinstance(points, Tensor) else array
+    if not isinstance(points, Tensor):
+        return array
+    return torch.from_numpy(array).to(points, non_blocking=True)
 
 
 def tensor_like(value: float | Tensor, like: Tensor) -> Tensor:
     """Convert a number or a tensor to a tensor with the dtype and the device of `like`."""
-    return torch.as_tensor(value, dtype=like.dtype, device=like.device)
+    if isinstance(value, Tensor):
+        return value.to(like, non_blocking=like.is_cuda)
+    return like.new_full((), value)
 
 
 def orbit_cameras(

@@ -14,6 +14,7 @@ import re
 import reprlib
 import textwrap
 import unicodedata
+import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Set
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
@@ -464,19 +465,26 @@ def _require_magnitude(name: str, tensor: Tensor, limit: float, fault: str) -> N
     require((lowest >= -limit) & (highest <= limit), lambda: InputError(fault, name))
 
 
-# A truth value on a device, and the error if it is false.
-Check = tuple["Tensor", Callable[[], InputError]]
+# A truth value on a device, and the error or the warning if it is false.
+Check = tuple["Tensor", Callable[[], InputError | UserWarning]]
 # Checks that are decided later. None decides each at once.
 _LATE: ContextVar[list[Check] | None] = ContextVar("late checks", default=None)
 
 
-def require(holds: Tensor, error: Callable[[], InputError]) -> None:
+def require(holds: Tensor, error: Callable[[], InputError | UserWarning]) -> None:
     """Check a truth value that was computed on a device, now or at the end of `late_checks`."""
     late = _LATE.get()
     if late is not None:
         late.append((holds, error))
     elif not holds:
-        raise error()
+        report(error())
+
+
+def report(fault: InputError | UserWarning) -> None:
+    """Raise an error, or issue a warning."""
+    if isinstance(fault, InputError):
+        raise fault
+    warnings.warn(fault, stacklevel=3)
 
 
 @contextmanager
@@ -500,7 +508,7 @@ def joint_checks() -> Iterator[None]:
 
 
 def raise_first(checks: list[Check]) -> None:
-    """Raise the error of the first check that failed, and empty the list."""
+    """Raise the error of the first check that failed, issue warnings, and empty the list."""
     import torch
 
     # Some truth values may be on the CPU, others on a GPU.
@@ -508,8 +516,8 @@ def raise_first(checks: list[Check]) -> None:
     is_held = torch.stack(held).tolist() if held else []
     failed = [error for (_, error), holds in zip(checks, is_held, strict=True) if not holds]
     checks.clear()
-    if failed:
-        raise failed[0]()
+    for error in failed:
+        report(error())
 
 
 MEMORY = Path("/proc/meminfo")  # Linux writes the free memory of the machine here.

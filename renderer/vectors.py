@@ -82,7 +82,7 @@ def tangent_axes(x: Any, y: Any, z: Any, sign: Any) -> list[list[Any]]:
 def rotation_matrices(vectors: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3 3"]:
     """Convert rotation vectors, the axis times the angle in degrees, to rotation matrices."""
     radians = torch.deg2rad(vectors)
-    axes = torch.eye(3).to(radians).expand(*radians.shape, 3)
+    axes = torch.eye(3, dtype=radians.dtype, device=radians.device).expand(*radians.shape, 3)
     # Row i is the cross product of the rotation
     # vector and the unit vector of axis i.
     cross_products = torch.linalg.cross(radians[..., None, :].expand_as(axes), axes)

@@ -298,8 +298,10 @@ class Scene:
         """Return the V cameras of an example, which may have moved, by a row of conditions."""
         cameras = self.cameras[example]
         if conditions.cameras is not None:
-            # Changes of the polar angle, the azimuth and the logarithm of the distance.
-            cameras = tuple(camera.moved(*conditions.cameras[row]) for camera in cameras)
+            # Changes of the polar angle, the azimuth and the logarithm of the distance. They are
+            # read on the CPU, as numbers are: a GPU would be waited for at each.
+            changes = conditions.cameras[row].cpu()
+            cameras = tuple(camera.moved(*changes) for camera in cameras)
         if conditions.vertices is None:
             return cameras
         # The depth range of the cameras must contain vertices that have moved away from the origin.

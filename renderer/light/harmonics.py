@@ -174,7 +174,7 @@ def _legendre(z: Tensor, m: int, degree: int) -> Iterator[Tensor | float]:
     yield constant
     # The functions of bands l - 2 (before_previous) and l - 1 (previous) give the
     # function of band l.
-    before_previous = z.new_tensor(constant)
+    before_previous = z.new_full((), constant)
     previous = z * math.sqrt(2 * m + 3) * constant
     for l in range(m + 1, degree + 1):
         if l > m + 1:

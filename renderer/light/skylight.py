@@ -17,7 +17,7 @@ Parameters", after Habel et al. 2008.
 """
 
 import math
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import Tensor
 
-from renderer.errors import InputError, as_tensor, require_finite
+from renderer.errors import InputError, as_tensor, require, require_finite
 from renderer.light.basis import HARMONICS
 from renderer.light.harmonics import rows_and_orders
 from renderer.modes import once_differentiable, without_autocast
@@ -115,17 +115,18 @@ class _FittedSky(torch.autograd.Function):
         # Each product of two polynomials, with the axes: sky and its two derivatives, shape of the
         # parameters, polynomial of the zenith angle, polynomial of 1 / turbidity.
         products = zenith_factors[..., :, None] * turbidity_factors[..., None, :]
-        polynomials = fit.to(products).flatten(2).flatten(0, 1)
+        polynomials = fit.to(products, non_blocking=True).flatten(2).flatten(0, 1)
         # Coefficients with m ≥ 0 for a sun at azimuth 0, with the axes: sky and its two
         # derivatives, shape of the parameters, 28 coefficients, 3 colors.
         at_azimuth_zero = (products.flatten(-2) @ polynomials).unflatten(-1, (-1, 3))
-        orders = _ORDERS.to(azimuth)
+        indices = _ROW_IN_FIT, _ORDERS, _OPPOSITE_ORDER
+        rows, orders, opposite = (ids.to(azimuth.device, non_blocking=True) for ids in indices)
         angles = azimuth[..., None] * orders.abs()
         # cos(mφ) for m ≥ 0, and sin(|m| φ) for m < 0, shape (..., 49, 1).
         rotation = torch.where(orders < 0, angles.sin(), angles.cos())[..., None]
-        value, by_zenith, by_turbidity = at_azimuth_zero[..., _ROW_IN_FIT, :] * rotation
+        value, by_zenith, by_turbidity = at_azimuth_zero[..., rows, :] * rotation
         # The derivative of cos mφ is -m sin mφ, which belongs to the harmonic of order -m.
-        by_azimuth = -orders[:, None] * value[..., _OPPOSITE_ORDER, :]
+        by_azimuth = -orders[:, None] * value[..., opposite, :]
         ctx.save_for_backward(by_zenith, by_azimuth, by_turbidity)
         return value
 
@@ -176,12 +177,16 @@ def _as_parameters(
     for name, (low, high, expected) in ranges.items():
         value = tensors[name].to(like.dtype)
         # Both comparisons are False for NaN, so NaN counts as outside.
-        is_outside = ~((value >= low * (1 - rounding)) & (value <= high * (1 + rounding)))
-        if is_outside.any():
-            first = value[is_outside][0].item()
-            raise InputError(f"{name}={first:.9g} is out of the sky model's range: give {expected}")
+        is_inside = (value >= low * (1 - rounding)) & (value <= high * (1 + rounding))
+        require(is_inside.all(), partial(_range_error, name, expected, value, is_inside))
     angles = (torch.deg2rad(tensors[name]).to(like.dtype) for name in ("zenith", "azimuth"))
     return [*angles, tensors["turbidity"].to(like.dtype)]
+
+
+def _range_error(name: str, expected: str, value: Tensor, is_inside: Tensor) -> InputError:
+    """Return the error that names the first value that is not inside the range."""
+    first = value[~is_inside][0].item()
+    return InputError(f"{name}={first:.9g} is out of the sky model's range: give {expected}")
 
 
 def _chebyshev(x: Tensor, slope: Tensor | float, count: int) -> tuple[Tensor, Tensor]:

@@ -409,7 +409,8 @@ class OperatorStack:
         parts = [self._sparse[operator] for operator in operator_of_image.tolist()]
         entries = apply.concatenate_entries(parts)
         entry_counts = torch.tensor([len(part.function) for part in parts])
-        image_of_entry = torch.arange(len(parts)).repeat_interleave(entry_counts).to(lights.device)
+        image_of_entry = torch.arange(len(parts)).repeat_interleave(entry_counts)
+        image_of_entry = image_of_entry.to(lights.device, non_blocking=True)
         # Row of the coefficient of each entry, if the coefficients of all images are
         # written below each other.
         light_row = image_of_entry * lights.shape[1] + entries.function

@@ -151,7 +151,8 @@ def mesh_textures(mesh: Mesh, encoding: str, like: Tensor) -> list[Texture]:
     """
     # A channel has only 256 possible values. A table with the linear value of each saves
     # decoding every texel.
-    linear_values = decode(torch.arange(256, dtype=torch.float64) / 255, encoding).to(like)
+    linear_values = decode(torch.arange(256, dtype=torch.float64) / 255, encoding)
+    linear_values = linear_values.to(like, non_blocking=True)
 
     def look_up(all_texels: Tensor, texels: Tensor) -> Tensor:
         """Look up the linear values (3, N) of N texels (N,) of a texture with 8 bits."""

@@ -32,8 +32,8 @@ is the number of SH coefficients of environment light, (degree + 1)².
 from __future__ import annotations
 
 import math
-import warnings
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -41,7 +41,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from renderer.errors import InputError, as_tensor, require_flag
+from renderer.errors import InputError, as_tensor, require, require_flag
 from renderer.light.harmonics import bands, lambertian_factors
 from renderer.mesh import Mesh, require_mesh
 from renderer.microfacets import DIELECTRIC, EDGE, SCHLICK, Vectors, reflectance
@@ -128,11 +128,13 @@ class Gloss:
                 # `as_tensor` would round a Python number to float32.
                 values = torch.tensor(float(given), dtype=torch.float64)
             has_right_shape = values.shape in ((), (1,), (faces,))
-            # A comparison with NaN is False, so `not` also finds NaN.
-            if not has_right_shape or not (values.min() >= 0 and values.max() <= 1):
-                fault = f"{name} has shape {tuple(values.shape)} or values outside [0, 1]"
-                advice = f"give one number, or {faces} numbers (one per face), in [0, 1]"
-                raise InputError(f"gloss: {fault}: {advice}")
+            fault = f"{name} has shape {tuple(values.shape)} or values outside [0, 1]"
+            advice = f"give one number, or {faces} numbers (one per face), in [0, 1]"
+            error = partial(InputError, f"gloss: {fault}: {advice}")
+            if not has_right_shape:
+                raise error()
+            # A comparison with NaN is False.
+            require((values.min() >= 0) & (values.max() <= 1), error)
             checked.append(values.reshape(-1))
         return checked
 
@@ -322,16 +324,18 @@ def sample_gloss(mesh: Mesh, fragments: Fragments, gloss: Gloss | None) -> Sampl
         for values in columns
     )
     if gloss_textures:
-        factors = [torch.from_numpy(texture).to(fragments.coverage) for texture in gloss_textures]
+        factors = [
+            torch.from_numpy(texture).to(fragments.coverage, non_blocking=True)
+            for texture in gloss_textures
+        ]
         textures = [Texture.from_values(values / 255) for values in factors]
         # The two channels of a texture are factors for the roughness and for metallic.
         roughness_factor, metallic_factor = sample_textures(textures, mesh, fragments)
         roughness = roughness * roughness_factor
         metallic = metallic * metallic_factor
-    if (roughness < MIN_ROUGHNESS).any():
-        shaded = f"Roughness below {MIN_ROUGHNESS} is shaded as {MIN_ROUGHNESS}"
-        reason = "the smallest roughness that light of degree 40 shows."
-        warnings.warn(f"{shaded}, {reason}", stacklevel=2)
+    shaded = f"Roughness below {MIN_ROUGHNESS} is shaded as {MIN_ROUGHNESS}"
+    reason = "the smallest roughness that light of degree 40 shows."
+    require((roughness >= MIN_ROUGHNESS).all(), lambda: UserWarning(f"{shaded}, {reason}"))
     return SampleGloss(roughness.clamp(min=MIN_ROUGHNESS), metallic, specular_factor)
 
 
@@ -343,9 +347,9 @@ def toward_camera(fragments: Fragments, vertices: Float[Tensor, "V 3"]) -> Float
     """
     # A row is (x, y, z, 1) with the position of a perspective camera, or (x, y, z, 0) with the
     # direction to an orthographic camera. There is one row for the only view, or for each sample.
-    eyes = fragments.eyes.to(vertices)
+    eyes = fragments.eyes.to(vertices, non_blocking=vertices.is_cuda)
     position, w = eyes[:, :3], eyes[:, 3:]
-    if len(eyes) == 1 and not w:
+    if len(eyes) == 1 and not fragments.cameras[0].has_perspective:
         return position
     points = fragments.interpolate(vertices[fragments.corners])
     return unit((position - w * points).T).T

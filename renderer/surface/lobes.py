@@ -135,7 +135,8 @@ class ViewFrame(NamedTuple):
         degree = (math.isqrt(8 * len(lobes) + 1) - 3) // 2
         # In sample axes, the coefficients of the orders m ≥ 0 are c_lm s_m cos mφ, and those of
         # the orders -m < 0 are c_lm s_m sin mφ (see the module).
-        functions, orders = (ids.to(lobes.device) for ids in rows_and_orders(degree))
+        indices = rows_and_orders(degree)
+        functions, orders = (ids.to(lobes.device, non_blocking=True) for ids in indices)
         # The normal is (sin θ cos φ, sin θ sin φ, cos θ). The smallest sine avoids a division
         # by 0 at θ = 0, where its powers make the factors 0 or 1, and gradients finite.
         x, y, _ = self.normals
@@ -207,8 +208,7 @@ def _complex_powers(x: Tensor, y: Tensor, degree: int) -> Tensor:
 def _rotate_harmonics(coefficients: Tensor, angle: Angle) -> Tensor:
     """Rotate SH coefficients u about z by a, x to y: u'_m = cos(ma) u_m - sin(ma) u_-m."""
     degree = math.isqrt(len(coefficients)) - 1
-    _, order = rows_and_orders(degree)
-    order = order.to(coefficients.device)
+    order = rows_and_orders(degree)[1].to(coefficients.device, non_blocking=True)
     # Rows for m from -degree to degree: sin(|m| a) if m < 0, and cos(ma) if m ≥ 0.
     sines_and_cosines = _complex_powers(angle.cosine, angle.sine, degree)
     sines = sines_and_cosines[:degree]
@@ -225,7 +225,8 @@ def _rotate_harmonics(coefficients: Tensor, angle: Angle) -> Tensor:
 def _multiply_bands(rotation: Tensor, coefficients: Tensor) -> Tensor:
     """Rotate SH coefficients by a matrix, which has only one block per degree on its diagonal."""
     slices = [slice(l * l, (l + 1) * (l + 1)) for l in range(math.isqrt(len(coefficients)))]
-    return torch.cat([rotation[b, b].to(coefficients) @ coefficients[b] for b in slices])
+    rotation = rotation.to(coefficients, non_blocking=True)
+    return torch.cat([rotation[b, b] @ coefficients[b] for b in slices])
 
 
 @cache_tensors
@@ -247,7 +248,7 @@ def lobe_functions(
     function_count = (degree + 1) * (degree + 2) // 2
     table = _table_like(max(degree, COMMON_DEGREE), cosine.dtype, cosine.device)
     # Axes: Fresnel term, lobe function, polynomial in the roughness, one in the cosine.
-    coefficients = table[list(terms), :function_count]
+    coefficients = torch.stack([table[term, :function_count] for term in terms])
     in_cosine = _cosine_polynomials(cosine, coefficients.shape[-1])
     in_roughness = roughness_polynomials(roughness)
     if len(roughness) == 1:
@@ -266,7 +267,7 @@ def coat_albedo(cosine: Tensor, roughness: Tensor) -> Tensor:
     directions, because the reflectance does not change if the directions of light
     and camera are exchanged. The result is differentiable.
     """
-    coefficients = _coat_coefficients().to(cosine)
+    coefficients = _coat_coefficients().to(cosine, non_blocking=True)
     in_cosine = _cosine_polynomials(cosine.flatten(), coefficients.shape[1])
     cosine_coefficients = coefficients.T @ roughness_polynomials(roughness.flatten())
     return (cosine_coefficients * in_cosine).sum(0).view_as(cosine)
@@ -299,7 +300,7 @@ def coat_mean(roughness: Tensor) -> Tensor:
     The fraction is E_avg = 2 ∫ E(μ) μ dμ over 0 ≤ μ ≤ 1, with the reflected
     fraction E(μ) of a single beam (`coat_albedo`). The result is differentiable.
     """
-    factors = coat_irradiance_factors(0).to(roughness)
+    factors = coat_irradiance_factors(0).to(roughness, non_blocking=True)
     return (factors @ roughness_polynomials(roughness))[0] / math.pi
 
 

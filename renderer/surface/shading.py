@@ -161,7 +161,8 @@ def _coat_irradiance(
     # The coat multiplies each coefficient of the light by a factor, which is a sum over R
     # polynomials of the roughness. One row for each coefficient, one column for each
     # polynomial.
-    factor_coefficients = coat_irradiance_factors(degree).to(light)[harmonics.bands(degree)]
+    factor_coefficients = coat_irradiance_factors(degree)[harmonics.bands(degree)]
+    factor_coefficients = factor_coefficients.to(light, non_blocking=True)
     # One row for each polynomial, one column for each sample (or one for all samples).
     polynomials = roughness_polynomials(gloss.roughness)
     if len(gloss.roughness) == 1:
@@ -199,7 +200,8 @@ class _HarmonicSum(torch.autograd.Function):
         for power in range(max(degree - 1, 1), degree + 1):
             # Gradient of each harmonic, with the axes: direction of the derivative,
             # monomial, harmonic.
-            harmonic_gradients = _gradients(power).to(coefficients)[..., : len(coefficients)]
+            harmonic_gradients = _gradients(power)[..., : len(coefficients)]
+            harmonic_gradients = harmonic_gradients.to(coefficients, non_blocking=True)
             # Gradient of the sum, with the axes: direction of the derivative, monomial,
             # channel.
             in_monomials = harmonic_gradients @ coefficients[: harmonic_gradients.shape[2]]
@@ -262,14 +264,11 @@ class _Irradiance(torch.autograd.Function):
         directions, lengths = unit_vectors(normals)
         directions = directions.to(light.dtype)
         value, gradient = _evaluate_polynomial(light, directions)
-        zero_normals = torch.nonzero(lengths == 0).squeeze(1)
-        if len(zero_normals):
-            degree = math.isqrt(len(light)) - 1
-            # The polynomial is the irradiance only for unit normals. For normals of length
-            # 0, the harmonics are evaluated instead.
-            zeros = directions[:, zero_normals]
-            nonzero, irradiance_per_unit = harmonics.diffuse_basis(zeros, degree)
-            value[:, zero_normals] = light[nonzero].T @ irradiance_per_unit
+        is_zero = lengths == 0
+        if is_zero.is_cuda or len(is_zero.nonzero()):  # The second test would wait for a GPU.
+            # The polynomial is the irradiance only for unit normals.
+            per_unit = _irradiance_at_zero(math.isqrt(len(light)) - 1).to(light, non_blocking=True)
+            value = torch.where(is_zero, light.T @ per_unit, value)
         ctx.save_for_backward(directions, lengths, gradient if ctx.needs_input_grad[0] else None)
         ctx.light_shape = light.shape
         return value
@@ -299,6 +298,14 @@ class _Irradiance(torch.autograd.Function):
                 nonzero, irradiance_per_unit = harmonics.diffuse_basis(block_directions, degree)
                 light_gradient[nonzero] += irradiance_per_unit @ block_upstream.T
         return normal_gradient, light_gradient
+
+
+@harmonics.cache_tensors
+def _irradiance_at_zero(degree: int) -> Float[Tensor, "K 1"]:
+    """Evaluate the irradiance of each harmonic at a normal of length 0."""
+    zero = torch.zeros(3, 1, dtype=torch.float64)
+    nonzero, per_unit = harmonics.diffuse_basis(zero, degree)
+    return zero.new_zeros((degree + 1) ** 2, 1).index_copy(0, torch.tensor(nonzero), per_unit)
 
 
 def _evaluate_polynomial(
@@ -388,7 +395,9 @@ def normals_in_sight(
         # The mesh caches these normals, so all its views share them.
         return of_seen_faces(mesh.corner_normals, fragments)
     arrays = mesh.faces, mesh.normal_ids
-    faces, normal_ids = (torch.from_numpy(ids).to(moved.device) for ids in arrays)
+    faces, normal_ids = (
+        torch.from_numpy(ids).to(moved.device, non_blocking=True) for ids in arrays
+    )
     # All first corners of the seen faces, then all second and third corners.
     seen_ids = normal_ids.index_select(0, fragments.faces).T.flatten()
     count = int(mesh.normal_ids.max()) + 1
@@ -396,7 +405,8 @@ def normals_in_sight(
     is_seen[seen_ids] = True
     # A normal is an average over all faces that share it, so these are all needed.
     is_needed = is_seen.index_select(0, normal_ids.flatten()).view(-1, 3).any(1)
-    needed = is_needed.nonzero().squeeze(1)
+    # A GPU would be waited for, and computes all of them as fast.
+    needed = slice(None) if moved.is_cuda else is_needed.nonzero().squeeze(1)
     vertices = moved.to(torch.promote_types(moved.dtype, torch.float32))
     normals = vertex_normals(vertices, faces[needed], normal_ids[needed], count)
     return normals.T.index_select(1, seen_ids).unflatten(1, (3, -1)).permute(2, 1, 0)

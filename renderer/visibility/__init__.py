@@ -85,7 +85,9 @@ class Rasterizer:
         name = "torch" if self.is_automatic and given.is_cuda else self.name
         rasterize = import_module(f"renderer.visibility.{name}").rasterize
         if name == "torch":
-            ids = rasterize(given, as_tensor(faces, device=given.device), shape, closed)
+            ids = rasterize(
+                given, as_tensor(faces).to(given.device, non_blocking=True), shape, closed
+            )
         else:
             ids = from_numpy(rasterize(given.cpu().numpy(), faces, shape, closed))
         return ids.to(given.device) if isinstance(points, Tensor) else ids.numpy()

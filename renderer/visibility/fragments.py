@@ -408,7 +408,7 @@ def build_fragments(
     if isinstance(vertices, Tensor):
         points = vertices.detach()
         points = points.double() if points.is_cuda else points.cpu().double().numpy()
-    all_faces = torch.as_tensor(faces, device=torch.as_tensor(points).device)
+    all_faces = torch.as_tensor(faces).to(torch.as_tensor(points).device, non_blocking=True)
     if any(camera.has_perspective for camera in cameras):
         # A vertex that no face uses may lie behind a camera. The first corner takes its place.
         corners = all_faces.flatten()

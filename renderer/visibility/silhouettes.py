@@ -238,7 +238,8 @@ class _MovingView:
         # radiances times the mean of the two upstream gradients.
         before, after = grid[:, samples - 1 : -1 : samples], grid[:, samples::samples]
         are_covered = (before >= 0) & (after >= 0)
-        before, after = before[are_covered], after[are_covered]
+        covered = are_covered.nonzero(as_tuple=True)
+        before, after = before[covered], after[covered]
         upstream_sum = upstream_at_samples[:, before] + upstream_at_samples[:, after]
         radiance_difference = self.radiance[:, before] - self.radiance[:, after]
         corrected = (radiance_difference * upstream_sum).sum(0) / 2
@@ -330,7 +331,7 @@ class _Silhouettes:
         self.places = to_fixed_point(points, (rows, columns))[0].T.double() / SUBSAMPLES
         key = np.ascontiguousarray(faces, dtype=np.int64).tobytes()
         all_ends, edge_of_side, direction, face_count = _edges(key, points.device)
-        corners = torch.from_numpy(faces).to(points.device).T
+        corners = torch.from_numpy(faces).to(points.device, non_blocking=True).T
         orientation = doubled_areas(self.places[:, corners]).sign()
         # One number for each face and each of its three edges: 1 if the face lies on one side of
         # the edge, and -1 if it lies on the other side. An edge leads to its higher vertex index.
@@ -353,10 +354,9 @@ class _Silhouettes:
         rows, columns = self.sample_grid.shape
         start, end = self.places[:, self.ends].unbind(1)
         # Places (cuts) where edges cross rows of samples for the axis X, or columns for Y.
-        across_and_along = [1 - axis, axis]
         shape = (rows, columns) if axis == X else (columns, rows)
-        places = start[across_and_along], end[across_and_along]
-        edge, line, fraction, next_sample = _cut_edges(*places, shape)
+        places = [ends.flip(0) if axis == X else ends for ends in (start, end)]
+        edge, line, fraction, next_sample = _cut_edges(places[0], places[1], shape)
         # Row-major indices of the first sample after each cut, and of the sample before.
         row, column, step = (line, next_sample, 1) if axis == X else (next_sample, line, columns)
         after = row * columns + column
@@ -380,7 +380,8 @@ class _Silhouettes:
         # Of all cuts between the same two samples, keep the one with the smallest distance.
         for keys in (distance, after):
             order = order[keys[order].argsort(stable=True)]
-        kept = order[after[order].diff(prepend=after.new_tensor([-1])) != 0]
+        is_first = after[order].diff(prepend=after.new_full((1,), -1)) != 0
+        kept = order[is_first]
         edge = edge[kept]
         horizontal = torch.full_like(edge, axis == X, dtype=torch.bool)
         of_edges = self.ends[:, edge], fraction[kept], self.normal[:, edge]
@@ -437,8 +438,8 @@ def _cut_edges(
     # Position of the crossing on the edge, from 0 at the start of the edge to 1 at its end.
     fraction = (line - start[0, edge]) / (end[0] - start[0])[edge]
     next_sample = (start[1, edge] + fraction * (end[1] - start[1])[edge]).ceil().long()
-    is_inside = (next_sample > 0) & (next_sample < shape[1])
-    return edge[is_inside], line[is_inside], fraction[is_inside], next_sample[is_inside]
+    inside = ((next_sample > 0) & (next_sample < shape[1])).nonzero().squeeze(1)
+    return edge[inside], line[inside], fraction[inside], next_sample[inside]
 
 
 @lru_cache(maxsize=4)

@@ -146,7 +146,7 @@ class Skylight(Parameter):
         sky = sky_coefficients(zenith, azimuth, values[:, 2] * TURBIDITY_UNIT)
         sky = sky * self._scale[examples, None, None]
         if self._window is not None:
-            sky = sky * self._window.to(sky)[:, None]
+            sky = sky * self._window.to(sky, non_blocking=True)[:, None]
         # The lighting of the scene may have more coefficients. Those of the sky are then 0.
         sky = F.pad(sky, (0, 0, 0, self._basis.size - sky.shape[-2]))
         return replace_light(conditions, self._rows, sky.to(conditions.light))

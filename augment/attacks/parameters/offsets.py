@@ -135,6 +135,7 @@ class Pixels(Parameter):
         start = scene.lights.new_zeros(len(scene), math.prod(self._images_shape))
         # Images of all examples before the attack, or NaN until they are needed.
         self._images = torch.full_like(start, math.nan) if is_alone else None
+        self._missing = len(scene)  # The number of examples without images.
         super().__init__(settings, start)
 
     def project_feasible(
@@ -158,9 +159,10 @@ class Pixels(Parameter):
     def _images_of(self, kept: Float[Tensor, "_ D"], examples: Examples | slice) -> Values:
         """Return the images of examples before the attack, one row for each, and keep them."""
         rows = torch.arange(len(self._scene), device=self.start.device)[examples]
-        missing = rows[kept[rows, 0].isnan()]
+        missing = rows[kept[rows, 0].isnan()] if self._missing else rows[:0]
         with torch.no_grad():
             for group in missing.split(self._scene.group_size) if len(missing) else ():
                 images = self._scene.render(self._scene.conditions(group), group)
                 kept[group] = images.flatten(1)
+                self._missing -= len(group)
         return kept[rows]

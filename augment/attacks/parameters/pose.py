@@ -8,8 +8,6 @@ from itertools import chain
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Float
-from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from augment.attack_settings import PoseSettings
@@ -62,9 +60,10 @@ class Pose(Parameter):
         masks = [torch.from_numpy(item.own_vertices) for item in scene.objects]
         # Mask of the vertices of each object itself, without props and table, shape (objects, N).
         self._object_masks = pad_sequence(masks, batch_first=True).to(scene.lights.device)
-        # Height z of the ground of each object. None for an object without props or table, which
+        # Height z of the ground of each object. NaN for an object without props or table, which
         # may float.
-        self._grounds = [None if item.own is None else item.lowest for item in scene.objects]
+        grounds = [math.nan if item.own is None else item.lowest for item in scene.objects]
+        self._grounds = scene.lights.new_tensor(grounds)
         # Units of the rotation vector in degrees (3), the shift in world units (2), the logarithm
         # of the scale (1), polar angle and azimuth of the cameras in degrees (2), and the
         # logarithm of their distance (1).
@@ -97,27 +96,15 @@ class Pose(Parameter):
         changes = values * self._unit
         given = conditions.vertices
         vertices = self._scene.vertices[objects] if given is None else given
-        moved_vertices = [*map(self._moved, objects.tolist(), vertices, changes)]
-        # `stack` refuses an empty list, as there is without examples.
-        if moved_vertices:
-            vertices = torch.stack(moved_vertices)
-        return replace(conditions, vertices=vertices, cameras=changes[:, CAMERA])
-
-    def _moved(
-        self, index: int, vertices: Float[Tensor, "N 3"], change: Float[Tensor, " D"]
-    ) -> Float[Tensor, "N 3"]:
-        """Scale, rotate and shift an object of the scene.
-
-        The change is in degrees, world units and logarithms, in the order of `_unit`. Props
-        and table do not move, and the lowest vertex of an object on a ground stays on it.
-        """
-        object_mask, ground_height = self._object_masks[index], self._grounds[index]
-        scaled = change[SCALE].exp() * vertices
-        rotated = scaled @ rotation_matrices(change[ROTATION]).T
+        object_mask = self._object_masks[objects]
+        scaled = changes[:, SCALE, None, None].exp() * vertices
+        rotated = scaled @ rotation_matrices(changes[:, ROTATION]).mT
         # Append 0 for the shift along z.
-        moved = rotated + F.pad(change[SHIFT], (0, 1))
-        # Lift the object until its lowest vertex is on the ground.
-        if ground_height is not None:
-            lift = ground_height - moved[object_mask, 2].amin()
-            moved = moved + lift * moved.new_tensor([0, 0, 1])
-        return torch.where(object_mask[:, None], moved, vertices)
+        moved = rotated + F.pad(changes[:, SHIFT], (0, 1))[:, None]
+        # Lift each object with a ground until its lowest vertex is on it. Props and table stay.
+        lowest = moved[..., 2].masked_fill(~object_mask, math.inf).amin(1)
+        ground = self._grounds[objects]
+        lift = torch.where(ground.isnan(), 0, ground - lowest)
+        moved = moved + F.pad(lift[:, None], (2, 0))[:, None]
+        vertices = torch.where(object_mask[..., None], moved, vertices)
+        return replace(conditions, vertices=vertices, cameras=changes[:, CAMERA])
