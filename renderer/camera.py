@@ -479,9 +479,9 @@ def _as_scalar(name: str, value: Any) -> Any:
 
 def _like(array: np.ndarray, points: Points) -> Points:
     """Convert an array to a tensor on the device of the points, if they are one."""
-    if not isinstance(points, Tensor):
-        return array
-    return torch.from_numpy(array).to(points, non_blocking=True)
+    if isinstance(points, Tensor):
+        return torch.from_numpy(array).to(points, non_blocking=True)
+    return array
 
 
 def tensor_like(value: float | Tensor, like: Tensor) -> Tensor:

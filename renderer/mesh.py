@@ -511,12 +511,11 @@ def _quartered(mesh: Mesh, encoding: str) -> Mesh:
     normals = np.concatenate([mesh.normal_ids, mesh.normal_ids.max() + 1 + normal_of_side], axis=1)
     # Shading interpolates linear colors.
     linear = decode(torch.from_numpy(mesh.corner_colors), encoding).numpy()
-    colors = _interpolate_quarters(linear)
     return replace(
         mesh,
         vertices=np.concatenate([mesh.vertices, midpoints]),
         faces=points[:, _QUARTERS].reshape(-1, 3),
-        corner_colors=encode(torch.from_numpy(colors), encoding).numpy(),
+        corner_colors=encode(torch.from_numpy(_interpolate_quarters(linear)), encoding).numpy(),
         corner_uvs=_interpolate_quarters(mesh.corner_uvs),
         texture_ids=mesh.texture_ids.repeat(4),
         gloss=None if mesh.gloss is None else mesh.gloss.repeat(4, axis=0),

@@ -128,8 +128,7 @@ class _AreaVectors(torch.autograd.Function):
         # Rounding errors are large for nearly parallel edges (slivers), so these are computed
         # exactly.
         max_squared_length = MAX_SLIVER_SINE**2 * squared_u * squared_v
-        is_sliver = area_vectors.square().sum(0) <= max_squared_length
-        slivers = torch.nonzero(is_sliver).squeeze(1)
+        slivers = torch.nonzero(area_vectors.square().sum(0) <= max_squared_length).squeeze(1)
         if len(slivers):
             first, second, third = corners[:, :, slivers].unbind(1)
             area_vectors[:, slivers] = _exact_cross(first, second, third)
@@ -302,8 +301,7 @@ def _groups_of_file(
     # neighbors is compared.
     order = np.argsort(vertex * 2**33 + rounded @ [2**22, 2**11, 1])
     is_same_vertex = vertex[order[1:]] == vertex[order[:-1]]
-    in_order = np.stack([order[:-1], order[1:]])
-    pairs = np.concatenate([pairs, in_order[:, is_same_vertex]], axis=1)
+    pairs = np.concatenate([pairs, np.stack([order[:-1], order[1:]])[:, is_same_vertex]], axis=1)
     agree = _are_similar(unit_normals, pairs, FILE_ANGLE)
     count = vertex.max() + 1
     directed_edges = vertex * count + np.roll(faces, -1, axis=1).ravel()

@@ -175,5 +175,4 @@ class ShadedView:
         """Normals at the corners of the G seen faces, shape (G, 3, 3), or None for flat shading."""
         if self.settings.normals == "flat":
             return None
-        moved = self.vertices if self.is_moved else None
-        return normals_in_sight(self.mesh, self.fragments, moved)
+        return normals_in_sight(self.mesh, self.fragments, self.vertices if self.is_moved else None)

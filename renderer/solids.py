@@ -104,8 +104,7 @@ def apple(rng: Random) -> Mesh:
     # Points (radius, height) of the profile of the fruit and of its stalk.
     flesh = 0.88 * np.stack([radius, height], axis=1)
     stalk_top = rng.uniform(0.7, 0.9)
-    stalk = [(0.03, stalk_top), (0, stalk_top)]
-    vertices, faces, section = revolve(flesh, stalk)
+    vertices, faces, section = revolve(flesh, [(0.03, stalk_top), (0, stalk_top)])
     # A random field that varies slowly along z looks like vertical streaks.
     streaks = ripples(rng, vertices * [1, 1, 0.2], wavelength=0.5)
     streaks += ripples(rng, vertices, wavelength=2.0)
@@ -123,8 +122,7 @@ def pear(rng: Random) -> Mesh:
     radius = width * np.cos(latitude)
     # Points (radius, height) of the profile of the fruit and of its stalk.
     flesh = np.stack([radius, 0.88 * np.sin(latitude) - 0.12], axis=1)
-    stalk = [(0.03, 0.97), (0, 0.97)]
-    vertices, faces, section = revolve(flesh, stalk)
+    vertices, faces, section = revolve(flesh, [(0.03, 0.97), (0, 0.97)])
     skin_color = draw(rng, (0.78, 0.78, 0.27), (0.6, 0.68, 0.22))
     patch_color = draw(rng, (0.55, 0.62, 0.16), (0.72, 0.6, 0.24))
     patches = ripples(rng, vertices, wavelength=1.5)
@@ -161,9 +159,8 @@ def mushroom(rng: Random) -> Mesh:
     cap_height = rng.uniform(0.5, 0.7)
     # Points (radius, height) of the three sections of the profile.
     stalk = [(0, -0.85), (0.26, -0.85), (0.3, -0.7), (0.2, -0.3), (0.18, 0.05)]
-    gills = [(cap_radius - 0.08, -0.02)]
     cap = arc((0, 0.08), (cap_radius, cap_height), 0, 90)
-    vertices, faces, section = revolve(stalk, gills, cap)
+    vertices, faces, section = revolve(stalk, [(cap_radius - 0.08, -0.02)], cap)
     brown = draw(rng, (0.55, 0.34, 0.18), (0.78, 0.62, 0.44))
     white_weight = 4 * ripples(rng, vertices, wavelength=0.5) - 3
     red_with_flecks = mix(draw(rng, (0.8, 0.1, 0.06)), (0.95, 0.93, 0.88), white_weight)
@@ -503,9 +500,8 @@ def ripples(rng: Random, points: Points, wavelength: float) -> Float[np.ndarray,
     """
     wave_vectors = rng.normal(size=(3, WAVES))
     wave_vectors *= 2 * np.pi / wavelength / np.linalg.norm(wave_vectors, axis=0)
-    phases = rng.uniform(0, 2 * np.pi, WAVES)
     # torch computes cosines much faster than NumPy.
-    waves = torch.from_numpy(points @ wave_vectors + phases).cos().numpy()
+    waves = torch.from_numpy(points @ wave_vectors + rng.uniform(0, 2 * np.pi, WAVES)).cos().numpy()
     # A cosine has the variance 1/2. The sum of 32 cosines therefore has the standard deviation 4.
     return waves.sum(axis=1) / 4
 

@@ -75,8 +75,7 @@ def tangent_axes(x: Any, y: Any, z: Any, sign: Any) -> list[list[Any]]:
     a = -1 / (sign + z)
     b = x * y * a
     first = [1 + sign * x * x * a, sign * b, -sign * x]
-    second = [b, sign + y * y * a, -y]
-    return [first, second]
+    return [first, [b, sign + y * y * a, -y]]
 
 
 def rotation_matrices(vectors: Float[Tensor, "... 3"]) -> Float[Tensor, "... 3 3"]:

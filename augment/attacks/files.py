@@ -105,10 +105,9 @@ def save(
         f"JPEG {JPEG_QUALITY}": as_jpeg(images, JPEG_QUALITY),
     }
     if verify:
-        rasterizer = result.problem.scene.rasterizer
         # Images of all examples by the name of the renderer, shape (E, V, 3, height, width) each.
         folders = progress(paths, "rendering the saved files")
-        rendered = [render_again(path, verify, rasterizer) for path in folders]
+        rendered = [render_again(path, verify, result.problem.scene.rasterizer) for path in folders]
         versions |= {name: torch.stack([views[name] for views in rendered]) for name in verify}
     for name, version in versions.items():
         numbers = _numbers_of_version(result, version.to(result.images_in_views))

@@ -530,6 +530,5 @@ def warn_of_exposure(scene: Scene, images: Float[Tensor, "E V 3 H W"] | None = N
         mean = float(image.movedim(1, 0)[:, mask].mean()) if mask.any() else MEAN
         if not DARK <= mean <= BRIGHT:
             kind = "dark" if mean < DARK else "bright"
-            name = scene.objects[index].name
             advice = "set exposure=auto or another light"
-            say_once(f"{name} is too {kind}: its mean is {mean:.2f}; {advice}")
+            say_once(f"{scene.objects[index].name} is too {kind}: its mean is {mean:.2f}; {advice}")

@@ -202,8 +202,7 @@ def load_object(item: ObjectSettings, vertices: int = 0, encoding: str = "linear
         left, right = min(left, low + shift), max(right, high + shift)
         moved = others[index].vertices + np.array([0, shift, 0])
         others[index] = replace(others[index], vertices=moved)
-    labels = [other.label for other in item.others]
-    return with_others(loaded, [*zip(labels, others, strict=True)])
+    return with_others(loaded, [*zip([other.label for other in item.others], others, strict=True)])
 
 
 def with_others(item: SceneObject, others: Sequence[tuple[str | int, Mesh]]) -> SceneObject:

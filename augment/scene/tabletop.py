@@ -355,10 +355,9 @@ def _sample_positions(camera: Camera, image: ImageSettings, ratio: float) -> tup
     # Distances of the rows down, and of the columns to the right, from the center of the image in
     # world units.
     counts = [side * image.samples for side in image.shape]
-    extents = camera.width * ratio, camera.width
     down, right = (
         ((torch.arange(count, dtype=torch.float64) + 0.5) / count - 0.5) * extent
-        for count, extent in zip(counts, extents, strict=True)
+        for count, extent in zip(counts, (camera.width * ratio, camera.width), strict=True)
     )
     # Measure from the principal point, which may be off the center of the image.
     half_width = camera.width / 2

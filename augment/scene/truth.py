@@ -103,8 +103,7 @@ def boxes_of(masks: Bool[Tensor, "... H W"]) -> Float[Tensor, "... 4"]:
         # `argmax` of a mask is the index of its first true entry.
         count = is_used.shape[-1]
         first = is_used.int().argmax(-1)
-        end = count - is_used.flip(-1).int().argmax(-1)
-        sides.append((first, end))
+        sides.append((first, count - is_used.flip(-1).int().argmax(-1)))
     (left, right), (top, bottom) = sides
     boxes = torch.stack([left, top, right, bottom], dim=-1).float()
     return boxes * masks.any(-1).any(-1, keepdim=True)

@@ -171,8 +171,7 @@ class SegmentationCriterion(ObjectCriterion):
         """Return the mean softplus of the log-odds of the true class over the object's pixels."""
         # Index of the true class at each pixel, shape (N, 1, H, W).
         source = self.source[:, None, None, None].expand(-1, 1, *outputs.shape[2:])
-        true_logit = outputs.gather(1, source)[:, 0]
-        odds = true_logit - outputs.scatter(1, source, -torch.inf).logsumexp(1)
+        odds = outputs.gather(1, source)[:, 0] - outputs.scatter(1, source, -torch.inf).logsumexp(1)
         masks = self.masks.to(odds)
         # Pixels that are lost already count little, so that the attack goes on to the others.
         return (F.softplus(odds) * masks).sum((1, 2)) / masks.sum((1, 2)).clamp(min=1)

@@ -54,9 +54,8 @@ def projector(pose: Pose, fov: float, pattern: Scene, scale: float) -> Scene:
     A white surface that faces the projector at distance 1 has the radiance pattern · scale. The
     pose is that of `pose_of`, and `fov` is in degrees.
     """
-    irradiance = {"type": "bitmap", **pattern, "raw": True}
     lens = {"fov": fov, "scale": scale, "to_world": pose}
-    return {"type": "projector", "irradiance": irradiance, **lens}
+    return {"type": "projector", "irradiance": {"type": "bitmap", **pattern, "raw": True}, **lens}
 
 
 def sensor(

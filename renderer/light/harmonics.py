@@ -280,13 +280,12 @@ def monomial_coefficients(degree: int) -> Float64[Tensor, "monomials K"]:
     # A polynomial follows from its derivatives. The coefficient of x^a y^b z^c is the
     # coefficient of x^(a-1) y^b z^c in the derivative with respect to x, divided by a. If
     # a = 0, the derivative with respect to y is used, and if a = b = 0, to z.
-    lower_coefficients = monomial_coefficients(degree - 1)
     # Derivatives with respect to x, y and z as sums of harmonics of bands below `degree`.
     # Axes: direction of the derivative, harmonic in the sum, harmonic Y_k.
     in_harmonics = homogeneous_gradients(degree)[:, : degree**2]
     # The same derivatives as sums of monomials of degree `degree` - 1: one row for each
     # monomial, one column for each harmonic Y_k.
-    along_x, along_y, along_z = lower_coefficients @ in_harmonics
+    along_x, along_y, along_z = monomial_coefficients(degree - 1) @ in_harmonics
     # Power of x, or of y if a = 0, or of z if a = b = 0.
     powers = [a or b or degree for a in range(degree, -1, -1) for b in range(degree - a, -1, -1)]
     # First come all monomials with x. Those with y but without x come from the last

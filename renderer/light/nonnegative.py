@@ -393,8 +393,7 @@ def _nearest(
         # Only one point satisfies the constraints, up to rounding.
         return original.clip(low, high), harmonics
     nearest = original + direction / rest * norm / weights
-    is_active = multipliers[: len(harmonics)] > 0
-    return nearest.clip(low, high), harmonics[is_active]
+    return nearest.clip(low, high), harmonics[multipliers[: len(harmonics)] > 0]
 
 
 def _find_negative_minima(

@@ -250,8 +250,7 @@ class Rays:
             # The last turn is filled up with zeros, which are blocked nowhere.
             in_turns = F.pad(directions, (0, 0, 0, turns * places - len(directions)))
             at_places = in_turns.view(turns, places, 3).transpose(0, 1)
-            group = pixels[places_of_pixel == places]
-            for block in group.split(max(1, BLOCK // len(directions))):
+            for block in pixels[places_of_pixel == places].split(max(1, BLOCK // len(directions))):
                 sample = surface.samples_of_rays(block, places).T
                 # Cosine of each direction to the shading normal, and height of the direction above
                 # the plane of the face, shape (places, turns, pixels of the block).
@@ -262,8 +261,7 @@ class Rays:
                 is_low = (height > 0) & (height <= horizon[sample][:, None])
                 cast = torch.nonzero(is_in_front & is_low)
                 place, turn, row = cast.T
-                origins = starts[sample[place, row]]
-                face = self.first_hit(origins, in_turns[turn * places + place])
+                face = self.first_hit(starts[sample[place, row]], in_turns[turn * places + place])
                 is_hit = face != NO_FACE
                 below = torch.nonzero(is_in_front & (height < 0))
                 place, turn, row = torch.cat([cast[is_hit], below]).T
@@ -362,9 +360,8 @@ class Rays:
         coordinate = (axes * corners[:, [0, 0, 1, 2]]).sum(2, keepdim=True)
         # Rays start at the offset above the face.
         coordinate[:, 0] += self.offset
-        planes = torch.cat([axes, -coordinate], 2)
         sines = []
-        for block in planes.split(8 * BLOCK // len(vertices) + 1):
+        for block in torch.cat([axes, -coordinate], 2).split(8 * BLOCK // len(vertices) + 1):
             above = csr_matrix((block[:, 0] @ vertices.T > 0).numpy())
             has_few = above @ face_count <= MAX_ABOVE
             pairs = (above.multiply(has_few[:, None]) @ faces_of_vertex).nonzero()
@@ -458,10 +455,9 @@ def path_reflectance(
     to_light = unit((paths.source - surface.points[sample]).T).T
     normals = surface.normals[sample]
     path_gloss = gloss.at(sample)
-    to_camera = at_samples(surface.toward, sample)
     # The reflection of metals (colored) is multiplied by the albedo. All other specular
     # reflection (white) has the color of the light.
-    colored, white = path_gloss.reflect_beams(normals, to_camera, to_light)
+    colored, white = path_gloss.reflect_beams(normals, at_samples(surface.toward, sample), to_light)
     diffuse_factor = gloss.diffuse_factor((surface.normals * surface.toward).sum(1))[sample]
     # The transmittance is the fraction of light that passes the coat to the diffuse layer.
     diffuse = diffuse_factor * path_gloss.coat_transmittance((normals * to_light).sum(1))

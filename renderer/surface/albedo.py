@@ -122,11 +122,10 @@ def _surrounding_texels(texture: Texture, uvs: Float[Tensor, "2 N"]) -> list[tup
     u, v = uvs
     height, width = texture.size
     # The coordinate v points up, but row 0 of the texture is at the top.
-    rows = _neighbors(1 - v, height)
     columns = _neighbors(u, width)
     return [
         (row_weight * column_weight, (row * width + column).long())
-        for row, row_weight in rows
+        for row, row_weight in _neighbors(1 - v, height)
         for column, column_weight in columns
     ]
 

@@ -324,10 +324,8 @@ def sample_gloss(mesh: Mesh, fragments: Fragments, gloss: Gloss | None) -> Sampl
         for values in columns
     )
     if gloss_textures:
-        factors = [
-            torch.from_numpy(texture).to(fragments.coverage, non_blocking=True)
-            for texture in gloss_textures
-        ]
+        like = fragments.coverage
+        factors = [torch.from_numpy(of).to(like, non_blocking=True) for of in gloss_textures]
         textures = [Texture.from_values(values / 255) for values in factors]
         # The two channels of a texture are factors for the roughness and for metallic.
         roughness_factor, metallic_factor = sample_textures(textures, mesh, fragments)

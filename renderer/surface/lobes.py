@@ -254,8 +254,7 @@ def lobe_functions(
     if len(roughness) == 1:
         return torch.einsum("tmrc,r->tmc", coefficients, in_roughness[:, 0]) @ in_cosine
     # Axes: polynomial in the roughness, polynomial in the cosine, sample.
-    products = in_roughness[:, None] * in_cosine
-    return coefficients.flatten(2) @ products.flatten(0, 1)
+    return coefficients.flatten(2) @ (in_roughness[:, None] * in_cosine).flatten(0, 1)
 
 
 def coat_albedo(cosine: Tensor, roughness: Tensor) -> Tensor:

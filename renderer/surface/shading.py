@@ -394,9 +394,9 @@ def normals_in_sight(
     if moved is None:
         # The mesh caches these normals, so all its views share them.
         return of_seen_faces(mesh.corner_normals, fragments)
-    arrays = mesh.faces, mesh.normal_ids
     faces, normal_ids = (
-        torch.from_numpy(ids).to(moved.device, non_blocking=True) for ids in arrays
+        torch.from_numpy(ids).to(moved.device, non_blocking=True)
+        for ids in (mesh.faces, mesh.normal_ids)
     )
     # All first corners of the seen faces, then all second and third corners.
     seen_ids = normal_ids.index_select(0, fragments.faces).T.flatten()

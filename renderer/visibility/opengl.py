@@ -124,8 +124,7 @@ def _draw(
     texture = context.texture(size, 1, dtype="i4")
     framebuffer = context.framebuffer([texture], context.depth_renderbuffer(size))
     framebuffer.use()
-    culling = moderngl.CULL_FACE if closed else moderngl.NOTHING
-    context.enable_only(moderngl.DEPTH_TEST | culling)
+    context.enable_only(moderngl.DEPTH_TEST | (moderngl.CULL_FACE if closed else moderngl.NOTHING))
     # The vertex shader turns the image upside down. Front faces, which are
     # counter-clockwise, then become clockwise.
     context.front_face = "cw"

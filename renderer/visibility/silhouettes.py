@@ -372,16 +372,14 @@ class _Silhouettes:
         # shows no surface, the minimum is minus infinity, and the edge is in front.
         tolerance = VISIBILITY_TOLERANCE * self.nearness_range
         is_in_front = edge_nearness >= surface_nearness.amin(0) - tolerance
-        is_visible = (samples != NOT_COVERED).any(0) & is_in_front
         # Distance from the sample with the farther surface, plus the same number for all cuts
         # between the same two samples.
         distance = torch.where(surface_nearness[0] < surface_nearness[1], place[axis], -place[axis])
-        order = is_visible.nonzero().squeeze(1)
+        order = ((samples != NOT_COVERED).any(0) & is_in_front).nonzero().squeeze(1)
         # Of all cuts between the same two samples, keep the one with the smallest distance.
         for keys in (distance, after):
             order = order[keys[order].argsort(stable=True)]
-        is_first = after[order].diff(prepend=after.new_full((1,), -1)) != 0
-        kept = order[is_first]
+        kept = order[after[order].diff(prepend=after.new_full((1,), -1)) != 0]
         edge = edge[kept]
         horizontal = torch.full_like(edge, axis == X, dtype=torch.bool)
         of_edges = self.ends[:, edge], fraction[kept], self.normal[:, edge]

@@ -200,10 +200,9 @@ def attack_folder(
         kept = {light: int((~item[index]).sum()) for light, item in result.changed.items()}
         predicted = classes[int(result.source[index])]
         photographs.append(RelitPhotograph(str(readable[row].path), predicted, kept, becomes))
-    pictures = _write_pictures(result, out)
     searched = settings.slides, settings.gain, settings.passes
     facts = len(found), unreadable, classifier.task.finds
-    scores = RelitScores(str(folder), *searched, photographs, pictures, *facts)
+    scores = RelitScores(str(folder), *searched, photographs, _write_pictures(result, out), *facts)
     write_json(out / RELIT, scores, durable=True, indent=1)
     return scores
 

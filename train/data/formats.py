@@ -242,8 +242,7 @@ def first_label(render: LabeledRender) -> str:
 def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
     """Return the uncompressed run lengths of COCO: of 0, then 1, ... down the columns."""
     flat = np.concatenate([[False], mask.T.ravel(), [False]])
-    changes = np.flatnonzero(flat[1:] != flat[:-1])
-    counts = np.diff(changes, prepend=0, append=mask.size).tolist()
+    counts = np.diff(np.flatnonzero(flat[1:] != flat[:-1]), prepend=0, append=mask.size).tolist()
     return counts if counts[-1] else counts[:-1]
 
 

@@ -120,9 +120,8 @@ def _hashes(folder: Path, photographs: Sequence[Photograph], labels: list[str]) 
     digests = {key: hashlib.sha256("\n".join(part).encode()) for key, part in parts.items()}
     for photograph in photographs:
         row = f"{photograph}{photograph.mesh or ''}".encode()
-        content = row + (folder / photograph.path).read_bytes()
         for digest in digests.values():
-            digest.update(content)
+            digest.update(row + (folder / photograph.path).read_bytes())
     return {key: digest.hexdigest() for key, digest in digests.items()}
 
 

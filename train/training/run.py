@@ -267,9 +267,8 @@ class Run:
             # The loss computes such predictions for the training images itself.
             labels = self.data.train.labels.clone()
             labels[self.held_out] = self._predict(model, self.data.train[self.held_out])
-            train = Split(self.data.train.images, labels)
             test = Split(self.data.test.images, predictions)
-            self.data = replace(self.data, train=train, test=test)
+            self.data = replace(self.data, train=Split(self.data.train.images, labels), test=test)
         if distributed.rank() > 0:
             return {}
         # For data without labels, this is 1, as the labels are these predictions.

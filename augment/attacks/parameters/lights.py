@@ -130,11 +130,10 @@ class Skylight(Parameter):
         self._units = settings.sun, settings.sun, TURBIDITY_UNIT
         units = torch.tensor(self._units, dtype=torch.float64)
         initial = units.new_tensor([getattr(settings, name) for name in SKY])
-        start = (initial / units).to(scene.lights)
         # The sky model is defined for all azimuths, but not for all zenith angles and turbidities.
         limits = units.new_tensor([ZENITH, (-math.inf, math.inf), TURBIDITY])
         self.box = (limits.T / units).to(scene.lights)
-        super().__init__(settings, start=start.expand(len(scene), -1))
+        super().__init__(settings, start=(initial / units).to(scene.lights).expand(len(scene), -1))
 
     def apply(self, values: Values, conditions: Conditions, examples: Examples) -> Conditions:
         """Return a copy of the conditions with the sky in place of the environment lighting.
