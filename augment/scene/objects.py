@@ -56,6 +56,7 @@ class SceneObject:
         center: Center of the mesh before normalization, shape (3,).
         extent: Scale of the mesh before normalization. A vertex v of `mesh` was
             at center + extent · v before.
+        source: Arguments of `load_object`, with which other instances are loaded.
     """
 
     label: str | int
@@ -67,6 +68,7 @@ class SceneObject:
     ground: Sequence[float] | None = None
     center: Sequence[float] = (0.0, 0.0, 0.0)
     extent: float = 1.0
+    source: tuple[ObjectSettings, int, str] | None = None
 
     @classmethod
     def from_mesh(
@@ -187,6 +189,7 @@ def load_object(item: ObjectSettings, vertices: int = 0, encoding: str = "linear
     item.require_first_place()
     mesh = subdivide(_load(item), vertices, encoding)
     loaded = SceneObject.from_mesh(item.label, mesh, item.albedo_scale, item.mesh)
+    loaded = replace(loaded, source=(item, vertices, encoding))
     if item.azimuth:
         loaded = rotated(loaded, _turn(item.azimuth))
     others = [_load_other(other) for other in item.others]
@@ -245,14 +248,11 @@ def resample_instance(item: SceneObject, seed: int) -> SceneObject:
     """
     # The name of a solid is "solid:NAME" or "solid:NAME:SEED".
     kind, *name_and_seed = item.name.split(":")
-    if kind != "solid" or len(name_and_seed) != 1:
+    if kind != "solid" or len(name_and_seed) != 1 or item.source is None:
         return item
-    mesh = normalize(solid(name_and_seed[0], seed))
-    gloss = item.mesh.gloss
-    if gloss is not None:
-        # All faces of a solid have the same gloss. Repeat it for the faces of the new shape.
-        gloss = gloss[:1].repeat(len(mesh.faces), axis=0)
-    return with_own_mesh(item, replace(mesh, gloss=gloss))
+    settings, vertices, encoding = item.source
+    settings = replace(settings, mesh=f"{item.name}:{seed}", others=[])
+    return with_own_mesh(item, load_object(settings, vertices, encoding).mesh)
 
 
 def rotated(item: SceneObject, rotation: Float[np.ndarray, "3 3"]) -> SceneObject:

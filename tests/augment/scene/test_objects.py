@@ -107,6 +107,13 @@ def test_another_instance_has_the_same_props():
     assert not np.array_equal(own, item.mesh.vertices[item.own_vertices])
 
 
+def test_another_instance_is_turned_and_subdivided_as_the_first():
+    item = load_object(ObjectSettings("solid:cup", "cup", azimuth=90), 2000)
+    expected = load_object(ObjectSettings("solid:cup:5", "cup", azimuth=90), 2000)
+    other = resample_instance(item, 5)
+    np.testing.assert_array_equal(other.mesh.vertices, expected.mesh.vertices)
+
+
 @pytest.mark.parametrize(
     "change",
     [
