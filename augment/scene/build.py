@@ -182,6 +182,7 @@ def build_scene(
         placed=not normalize,
         basis=basis,
         lights_of_degree=lights_of_degree,
+        exposure=settings.given_exposure,
     )
     return expose(built) if settings.adapts_exposure else built
 

@@ -96,8 +96,7 @@ class SceneObject:
 
         The other faces belong to other objects or to a table.
         """
-        count = len(self.mesh.faces)
-        return np.arange(count) < (count if self.own is None else self.own)
+        return np.arange(len(self.mesh.faces)) < (math.inf if self.own is None else self.own)
 
     @property
     def labels(self) -> list[str | int]:

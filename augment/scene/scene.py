@@ -66,6 +66,8 @@ class Scene:
             Its arguments are the degree, and the roughness of the smoothest surface (None if no
             surface has gloss). It returns the basis, and RGB coefficients of the light, shape
             (coefficients, 3). None if the lighting cannot be loaded again.
+        exposure: Factor that the environment light of `lights` includes. Lighting that
+            replaces it is multiplied by this factor.
 
     Attributes:
         views: Number V of views of an example.
@@ -95,6 +97,7 @@ class Scene:
     camera_effects: Callable[[Tensor, Tensor], Tensor] | None = None
     one_light: bool = False
     lights_of_degree: Callable[[int, float | None], tuple[Basis, Tensor]] | None = None
+    exposure: float = 1.0
 
     def __post_init__(self) -> None:
         """Check the arguments, and prepare the renderers."""

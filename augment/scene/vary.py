@@ -205,7 +205,7 @@ class _Variation:
             # With the roughness, highlights on glossy objects get no dark rings.
             roughness = reached_gloss(scene.objects).gloss_roughness
             maps = [load_light(name, harmonics.degree, roughness) for name in settings.environments]
-            environment = torch.stack(maps)[chosen].to(scene.lights)
+            environment = scene.exposure * torch.stack(maps)[chosen].to(scene.lights)
         if not settings.directional_fraction:
             return environment, torch.zeros(count, 3, dtype=torch.float64)
         # Factor by which the environment of an example with a directional light is dimmed.
@@ -330,8 +330,7 @@ def _move(
     """
     # A camera that sees half the width shows the object at twice the size.
     width = camera.width / scale
-    right = camera.right + shift[0] * width
-    up = camera.up + shift[1] * width
+    right, up = camera.right + shift[0] * width, camera.up + shift[1] * width
     moved = replace(_turn(camera, *turn), width=width, right=right, up=up)
     if has_table:
         # The polar angle is measured from the vertical, so its cosine is the sine of the elevation.

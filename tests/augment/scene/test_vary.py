@@ -16,6 +16,7 @@ from torchvision.ops import masks_to_boxes
 import augment
 from augment.augmentation_settings import SpecularLayerSettings, VariationSettings
 from augment.random_streams import generator
+from augment.scene.build import build_scene
 from augment.scene.objects import Conditions
 from augment.scene.patterns import MAX_ZOOM, draw_patterns, draw_photograph_patterns, pixel_centers
 from augment.scene.scene import Scene
@@ -338,6 +339,14 @@ def test_each_example_is_in_one_of_the_environments(scene):
     is_choice = (varied.lights[:, None] == choices).flatten(2).all(2)
     assert (is_choice.sum(1) == 1).all()
     assert is_choice.any(0).all()
+
+
+def test_the_exposure_of_a_scene_holds_for_the_environments_that_are_drawn():
+    lit, dim = (
+        drawn(build_scene([("solid:plate", "")], 8, exposure=factor), environments=["st_peters"])
+        for factor in (1.0, 0.25)
+    )
+    torch.testing.assert_close(dim.lights, 0.25 * lit.lights, rtol=1e-6, atol=0)
 
 
 def test_white_directional_light_of_unit_strength_comes_from_the_cameras_side(scene):
