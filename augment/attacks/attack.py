@@ -370,9 +370,10 @@ def _best_lights(
     for name in dict.fromkeys([settings.light, *files.PROBES, files.UNIFORM]):
         light = files.load_light(name, degree)
         for factor in EXPOSURES:
-            exposure = settings.given_exposure * factor
+            coefficients.append(light * settings.given_exposure * factor)
+            # The examples have the exposure that was chosen for their object, or 1.
+            exposure = settings.given_exposure * factor * scene.examples[0].exposure
             candidates.append(replace(settings, light=name, exposure=exposure))
-            coefficients.append(light * exposure)
     # Row n · E + e is example e of the scene in light n. All lights are rendered and classified in
     # large batches.
     examples = torch.arange(len(scene), device=scene.lights.device).repeat(len(candidates))

@@ -61,6 +61,17 @@ def test_a_camera_and_light_are_found_in_which_all_views_are_classified_correctl
     assert result.clean_correct.all()
 
 
+def test_a_dark_object_is_found_at_multiples_of_the_exposure_that_is_chosen_for_it():
+    dark = augment.ObjectSettings("solid:orange:0", label="orange", albedo_scale=0.02)
+    settings = SceneSettings(exposure="auto")
+    build = partial(augment.build_scene, [dark], 16, rasterizer="numpy")
+    classifier = classifier_of(lambda images: 60 * (images[..., 6:10, 6:10].mean((1, 2, 3)) - 0.6))
+    *_, scene = find_scene(
+        classifier, settings, LIGHTING, lambda chosen: build(scene=chosen), 1, generator(0)
+    )
+    assert augment.attack(classifier, scene, settings=replace(LIGHTING, max_steps=0)).clean_correct
+
+
 def test_cameras_of_a_wide_lens_are_drawn_from_where_all_of_the_mesh_lies_before_them():
     settings = SceneSettings(fov=90.0, backgrounds=["behind.png"])
     _, *drawn = _candidates(settings, 50, torch.Generator().manual_seed(0))
