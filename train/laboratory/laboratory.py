@@ -24,6 +24,7 @@ import torch
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
+from augment.network import say_once
 from augment.progress import progress
 from augment.random_streams import stream_seed
 from augment.scene.objects import load_object
@@ -298,8 +299,7 @@ def path_traced(
         }
         if shot.wall is not None:
             scene["wall"] = _plane(look_at(shot.wall, shot.center), shot.table)
-        for index, part_shape in enumerate(_object_shapes(module, parts, shot)):
-            scene[f"part_{index}"] = part_shape
+        scene |= {f"part_{i}": part for i, part in enumerate(_object_shapes(module, parts, shot))}
         scenes = [load(module, {**scene, "light": light}) for light in _light_sources(shot)]
         images = [np.array(module.render(scene, spp=spp, seed=seed)) for scene in scenes]
         return np.sum(images, axis=0)
@@ -478,6 +478,8 @@ def read_subject(item: str | dict[str, Any], index: int) -> Subject:
     if Path(label).name != label or label == "..":
         fault = f"meshes[{index}] has the label {label!r}, which cannot be the name of a folder"
         raise InputError(f"{fault}: remove slashes and dots")
+    if settings.gloss is not None:
+        say_once(f"{settings.mesh}: path-traced test images do not show its gloss")
     parts = lab_parts(load_object(settings).mesh, settings.albedo_scale)
     return Subject(label, settings.mesh, parts)
 
@@ -516,5 +518,4 @@ def kept_aside_settings(
 
 def _generated(name: str, label: str, count: int) -> list[Any]:
     """Return the settings of generated solids of the same kind with different seeds."""
-    seeds = range(FIRST_SEED, FIRST_SEED + count)
-    return [{"mesh": f"solid:{name}:{seed}", "label": label} for seed in seeds]
+    return [{"mesh": f"solid:{name}:{FIRST_SEED + i}", "label": label} for i in range(count)]

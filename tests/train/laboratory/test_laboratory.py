@@ -108,6 +108,14 @@ def test_every_mesh_is_shown_in_dim_and_in_bright_light(tmp_path, monkeypatch, s
         assert shots == 1 or (min(values) < 0.2 * ratio and 2.5 / ratio < max(values))
 
 
+def test_gloss_that_renders_do_not_show_is_told(caplog):
+    glossy, matte = {"mesh": "solid:orange:8", "gloss": [0.3, 1.0]}, "solid:orange:8"
+    shot = draw(1, ["solid"])[0]
+    images = [path_traced(lab.read_subject(m, 0).parts, shot, 8, 4, 2, 0) for m in (glossy, matte)]
+    np.testing.assert_array_equal(*images)
+    assert caplog.messages == ["solid:orange:8: path-traced test images do not show its gloss"]
+
+
 def test_only_the_object_distinguishes_the_label_from_a_hard_negative(tmp_path):
     """The same mesh under both labels has the same photographs."""
     meshes = ["solid:orange:7", {"mesh": "solid:orange:7", "label": "other_orange"}]
