@@ -281,8 +281,8 @@ class _Variation:
         example = scene.examples[row]
         # Scenes with tables have one view.
         item, camera = scene.objects[example.object], example.cameras[0]
-        # The table stands at the lowest vertex, and the wall is behind the object.
-        room = Room(rays, item.radius, item.lowest, wall_distance)
+        # The table stands at the lowest vertex, and the wall is behind all objects.
+        room = Room(rays, item.radius, item.lowest, max(wall_distance, item.radius))
         # Projector and lamps of the scene, which also light the room.
         local = split_light(scene.basis, scene.lights[row].cpu().double()).local_lights
         # The exposure multiplies all light below, but must not change theirs.

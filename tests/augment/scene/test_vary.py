@@ -1,6 +1,7 @@
 """Scenes are varied within their settings, and each view differs as it should."""
 
 import math
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -20,6 +21,7 @@ from augment.scene.build import build_scene
 from augment.scene.objects import Conditions
 from augment.scene.patterns import MAX_ZOOM, draw_patterns, draw_photograph_patterns, pixel_centers
 from augment.scene.scene import Scene
+from augment.scene.tabletop import irradiance
 from augment.scene.vary import draw_camera_effects, vary
 from augment.settings import LampsSettings, ObjectSettings, ProjectorSettings
 from renderer.errors import InputError
@@ -265,6 +267,23 @@ def test_a_table_is_as_bright_as_the_exposure_makes_the_object():
     given, darker = (drawn(white, tables=1.0, exposure=[each] * 2) for each in (1.0, 0.25))
     assert given.backgrounds.amax() < 1  # Clipped values would hide the factor.
     torch.testing.assert_close(darker.backgrounds, 0.25 * given.backgrounds)
+
+
+def test_the_wall_stands_behind_all_objects_of_an_entry(monkeypatch):
+    light_room = Mock(side_effect=irradiance)
+    monkeypatch.setattr("augment.scene.vary.irradiance", light_room)
+    behind = ObjectSettings("solid:apple:1", at=[-3.0, 0.0])
+    scene = build_scene([ObjectSettings("solid:plate:1", others=[behind])], 8, width=8)
+    drawn(scene.with_count(6), tables=1.0)
+    vertices = torch.from_numpy(scene.objects[0].mesh.vertices)
+    for call in light_room.call_args_list:
+        room, camera = call.args[:2]
+        azimuth = math.radians(camera.azimuth)
+        towards_camera = (
+            vertices[:, :2] @ torch.tensor([math.cos(azimuth), math.sin(azimuth)]).double()
+        )
+        assert towards_camera.min() >= -room.wall
+    assert light_room.call_count == 6
 
 
 def test_a_draw_without_a_table_leaves_light_and_backgrounds_as_they_are(scene):
