@@ -206,7 +206,7 @@ def write_adversary(adversary: Adversary, folder: Path) -> dict[str, float]:
     folder.mkdir(parents=True, exist_ok=True)
     shown, settings, cameras = adversary.shown, adversary.settings, adversary.cameras
     height, width = settings.shape
-    export_mesh(shown.mesh, folder / MESH, settings.normals, cameras, shown.own, width / height)
+    export_mesh(shown.mesh, folder / MESH, settings.normals, cameras, shown.ends, width / height)
     (_, light), *local_lights = save_lights(folder, adversary.light, adversary.basis)
     # A background of one gray value needs no file. Its value is in the description.
     gray = float(adversary.background.flatten()[0])

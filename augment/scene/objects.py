@@ -143,8 +143,7 @@ class SceneObject:
             Cameras whose images of the normalized mesh are the same as those of
             the given cameras before normalization.
         """
-        center = np.array(self.center)
-        return tuple(camera.normalized(center, 1 / self.extent) for camera in cameras)
+        return tuple(each.normalized(np.array(self.center), 1 / self.extent) for each in cameras)
 
     def joined(self, others: Sequence[Mesh]) -> SceneObject:
         """Append the faces of other meshes to the mesh of the object.

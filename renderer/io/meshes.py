@@ -144,7 +144,7 @@ def export_mesh(
     path: str | Path,
     normals: str = "smooth",
     cameras: Sequence[Camera] = (),
-    first: int | None = None,
+    first: int | np.ndarray | None = None,
     aspect: float = 1.0,
 ) -> None:
     """Write a mesh to a .glb file.
@@ -163,7 +163,9 @@ def export_mesh(
         cameras: Cameras to write as nodes of the file, in this order. glTF has no
             off-center cameras: such a camera shows a larger image around the given one.
         first: Number of faces at the beginning of the mesh that are written
-            before all other faces. None sorts all faces by texture and gloss.
+            before all other faces, or an array with the ascending ends of several
+            such parts. Faces of a part are sorted by texture and gloss. None for a
+            single part.
         aspect: Width of the images of the cameras, divided by their height.
 
     Raises:
@@ -180,17 +182,18 @@ def export_mesh(
     given = errors.as_list("cameras", cameras, Camera, "a list of cameras")
     cameras = showing([camera.fixed() for camera in given], mesh.vertices, mesh.faces)
     errors.require_number("aspect", aspect, 1e-3, 1e3)
-    first = len(mesh.faces) if first is None else first
-    errors.require_whole("first", first, 0, len(mesh.faces))
+    ends = [len(mesh.faces)] if first is None else np.atleast_1d(first).tolist()
+    for end in ends:
+        errors.require_whole("first", end, 0, len(mesh.faces))
     unit_normals = mesh.written_normals(normals)
     if path.suffix.lower() != ".glb":
         raise InputError(f"{path} cannot be written as a mesh: choose a name that ends in .glb")
     tree = _Tree()
-    is_later = np.arange(len(mesh.faces)) >= first
+    part_of_face = np.searchsorted(ends, np.arange(len(mesh.faces)), side="right")
     # A row vector times this matrix is rotated in the opposite direction: from z up to y up.
     rotation = Y_UP_TO_Z_UP[:3, :3]
     primitives = []
-    for is_written, texture_id, gloss in by_material(mesh, is_later):
+    for is_written, texture_id, gloss in by_material(mesh, part_of_face):
         # Corners with the same values become one vertex: the index of the vertex (1), color (3),
         # texture coordinates (2) and normal (3). float64 does not round the index.
         columns = (mesh.faces[..., None], mesh.corner_colors, mesh.corner_uvs, unit_normals)

@@ -14,7 +14,14 @@ from oracles import draw_uniform, textured
 import augment
 from augment.attack_settings import PARAMETER_NAMES
 from augment.attacks.adversary import DESCRIPTION, Adversary, reload, write_adversary
-from augment.scene.objects import Example, SceneObject, add_table, load_object, with_others
+from augment.scene.objects import (
+    Example,
+    SceneObject,
+    add_table,
+    load_object,
+    name_mesh,
+    with_others,
+)
 from augment.scene.scene import Scene
 from augment.settings import ObjectSettings
 from renderer.errors import InputError
@@ -152,6 +159,22 @@ def test_the_objects_of_an_adversary_are_read_back_with_their_truth(tmp_path):
     assert expected.labels[0, 0].tolist() == [0, 1]
     for name, values in vars(expected).items():
         torch.testing.assert_close(getattr(truth, name), values, msg=name)
+
+
+def test_objects_beside_the_first_are_read_back_with_their_truth_if_some_have_textures(tmp_path):
+    pear = textured_pear()
+    given = [
+        {"mesh": name, "label": label, "scale": 0.4, "at": [0.6, y]}
+        for name, label, y in ((name_mesh(pear), "1", 1.0), ("solid:cup", "2", -1.0))
+    ]
+    item = load_object(ObjectSettings("solid:orange", "0", others=given))
+    scene = scene_with(add_table(item, BROWN))
+    start = scene.conditions(torch.arange(1))
+    images = scene.render(start, torch.arange(1))[0]
+    write_adversary(Adversary.of(scene, 0, start, images, images), tmp_path)
+    truth, expected = (of.truth(int) for of in (reload(tmp_path).scene(SOFTWARE), scene))
+    assert expected.labels[0, 0].tolist() == [0, 1, 2]
+    torch.testing.assert_close(truth.masks, expected.masks)
 
 
 @pytest.mark.parametrize("fov", [None, 50.0])
