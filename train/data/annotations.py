@@ -368,7 +368,7 @@ def _labels_without_image(photographs: Sequence[Annotated], labels: Sequence[Pat
     images = [file for of in folders for file in of.iterdir() if file.suffix.lower() in SUFFIXES]
     known = {file for image in images for file in _label_files(image)}
     beside = {file.parent for file in labels}
-    found = {file.absolute() for of in beside for file in of.glob("*.txt")}
+    found = {file.absolute() for of in beside for file in of.glob("[!.]*.txt")}
     return [str(file) for file in sorted(found - known) if file.name not in CLASS_FILES]
 
 
@@ -423,7 +423,7 @@ def _yolo_classes(folder: Path, given: Path | None) -> tuple[tuple[str, ...], Pa
     """
     # The folder itself, and the two above it.
     for parent in [folder, *list(folder.absolute().parents)[:2]]:
-        files = [file for suffix in YAML for file in parent.glob(f"*{suffix}")]
+        files = [file for suffix in YAML for file in parent.glob(f"[!.]*{suffix}")]
         # data.yaml comes first.
         files.sort(key=lambda file: (file.stem != "data", file))
         for file in [given] if given else files:

@@ -291,6 +291,17 @@ def test_names_of_labels_may_have_another_form_of_unicode(tmp_path):
     assert (len(read.photographs[0].boxes), read.missing) == (1, [])
 
 
+def test_files_that_macos_adds_are_no_labels_and_no_names_of_classes(tmp_path):
+    _draw(tmp_path / "images/a.png")
+    (tmp_path / "labels").mkdir()
+    (tmp_path / "labels/a.txt").write_text("0 0.5 0.5 0.2 0.2\n")
+    (tmp_path / "fruit.yaml").write_text("names: [apple]")
+    for name in ("labels/._a.txt", "._fruit.yaml"):
+        (tmp_path / name).write_bytes(b"\0\5\x16\7\0\2\0\0Mac OS X        \xb0")
+    read = read_annotations(tmp_path)
+    assert (read.classes, len(read.photographs[0].boxes), read.missing) == (("apple",), 1, [])
+
+
 def test_a_choice_among_several_files_of_names_is_said(tmp_path, caplog):
     _draw(tmp_path / "a.png")
     (tmp_path / "a.txt").write_text("0 0.5 0.5 0.2 0.2\n")
