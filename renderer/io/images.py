@@ -52,8 +52,8 @@ MAX_STEP = 4
 
 
 def is_hidden(name: str) -> bool:
-    """Return whether a file or folder is hidden, or was added by macOS."""
-    return name.startswith(".") or name == "__MACOSX"
+    """Return whether a file or folder is hidden, or was added by macOS, a NAS or Windows."""
+    return name.startswith(".") or name in ("__MACOSX", "@eaDir", "$RECYCLE.BIN")
 
 
 def read_image(path: str | Path, size: Size) -> Float[Tensor, "3 height width"]:

@@ -48,13 +48,14 @@ def find(folder: Path, label: str = "orange") -> list[tuple[str, str]]:
             "pear/b.PNG orange/2026/may/c.jpeg other_tomato/d.TIF",
             "orange/2026/may/c.jpeg:orange other_tomato/d.TIF:other_tomato pear/b.PNG:pear",
         ),
+        ("orange/a.jpg orange/@eaDir/a.jpg/THUMB_M.jpg $RECYCLE.BIN/R1.jpg", "orange/a.jpg:orange"),
         ("b.jpg a.gif", "a.gif:orange b.jpg:orange"),
         (
             "orange/a.JFIF orange/._a.jpg orange/.cache/b.jpg .git/c.jpg __MACOSX/a.jpg x.txt",
             "orange/a.JFIF:orange",
         ),
     ],
-    ids=["class folders at any depth", "flat", "hidden files"],
+    ids=["class folders at any depth", "thumbnails and bins", "flat", "hidden files"],
 )
 def test_images_are_found_with_their_class_in_sorted_order(tmp_path, files, expected):
     assert " ".join(map(":".join, find(touch(tmp_path, *files.split())))) == expected
