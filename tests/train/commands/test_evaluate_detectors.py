@@ -128,13 +128,14 @@ def test_photographs_of_which_none_can_be_read_are_refused(photographs):
         nb.evaluate(_find_white, photographs, classes=CLASSES, size=120, skip_unreadable=True)
 
 
+@pytest.mark.parametrize("photos", ["", "annotations.json"])
 @pytest.mark.parametrize("source", ["run=pretrained/detector", "network=run:pretrained/detector"])
 def test_a_run_is_scored_with_the_threshold_and_the_overlap_that_are_given(
-    call, photographs, tmp_path, source
+    call, photographs, tmp_path, source, photos
 ):
     labeled = (photographs / "annotations.json").read_text().replace("dog", "orange")
     (photographs / "annotations.json").write_text(labeled)
-    words = f"photos={photographs}", "threshold=0.9", "iou=0.75", "out=out"
+    words = f"photos={photographs / photos}", "threshold=0.9", "iou=0.75", "out=out"
     assert call("evaluate", source, *words) == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["threshold"], summary["iou"]) == (0.9, 0.75)
