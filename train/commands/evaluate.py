@@ -181,12 +181,13 @@ def evaluate(
             raise InputError("label is for classifiers and detectors: leave it out", "label")
         if isinstance(made.task, Detection):
             annotations = read_annotations(folder)
+            # A YAML file stands for the photographs in its folder.
+            folder = annotations.file if folder.is_file() else folder
         elif isinstance(made, Classifier):
             labels = choose_labels(as_folder("photos", folder), made.classes, label)
         # The folder of the results. It is checked before the long computation.
-        target = None
-        if out is not None:
-            target = output_folder(str(out), overwrite)
+        target = None if out is None else output_folder(str(out), overwrite)
+        if target:
             require_outside(target, folder)
         with sole_writer(target) if target else nullcontext():
             if not isinstance(made, Classifier):

@@ -139,3 +139,12 @@ def test_a_run_is_scored_with_the_threshold_and_the_overlap_that_are_given(
     assert call("evaluate", source, *words) == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["threshold"], summary["iou"]) == (0.9, 0.75)
+
+
+def test_no_scores_are_written_among_the_photographs_that_a_yaml_file_names(tmp_path):
+    Image.new("RGB", (60, 60)).save(tmp_path / "a.png")
+    (tmp_path / "a.txt").write_text("1 0.5 0.5 0.2 0.2\n")
+    file = tmp_path / "data.yaml"
+    file.write_text("names: [cat, dog]\ntrain: train.txt\n")
+    with pytest.raises(InputError, match="lies inside"):
+        nb.evaluate(_find_white, file, classes=CLASSES, size=120, out=tmp_path / "scores")
