@@ -26,7 +26,7 @@ from augment.tasks.task import NOTHING
 from renderer.errors import ShortRepr
 from renderer.image import to_unit
 from renderer.io.images import write_image
-from train.data.photographs import find_unlabeled, load_photographs
+from train.data.photographs import find_unlabeled, load_photographs, require_outside
 from train.results.first_screen import FirstScreen, ShownMetric
 from train.results.intervals import Units, leave_out_of_mean
 from train.results.pictures import Picture, evenly_spaced, read_pictures
@@ -181,6 +181,7 @@ def attack_folder(
     `options` are those of `attack_photographs`. With a `limit`, as many photographs at equal
     distances in the list are attacked, and as many objects in them.
     """
+    require_outside(out, folder)
     found = find_unlabeled(folder)
     chosen = evenly_spaced(found, options.get("limit", len(found)))
     readable, images, unreadable = load_photographs(

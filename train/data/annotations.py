@@ -325,9 +325,7 @@ def _read_yolo(folder: Path, file: Path | None = None) -> Annotations:
     polygon, as fractions of the sides of the image.
     """
     classes, named = _yolo_classes(folder, file)
-    # Labels of poses have keypoints after the box.
     content = _yaml_mapping(named) if named.suffix.lower() in YAML else {}
-    has_keypoints = "kpt_shape" in content
     paths = _validation_images(named, content) if named.parent == folder else []
     missing = [str(path) for path in paths if not path.is_file()]
     if paths:
@@ -341,7 +339,8 @@ def _read_yolo(folder: Path, file: Path | None = None) -> Annotations:
         labels = next(filter(Path.is_file, _label_files(path)), None)
         rows = []
         if labels is not None:
-            found = [*_yolo_rows(labels, len(classes), has_keypoints)]
+            # Labels of poses have keypoints after the box.
+            found = [*_yolo_rows(labels, len(classes), "kpt_shape" in content)]
             # A line that stands twice is one object, as for Ultralytics.
             rows = [*dict.fromkeys(found)]
             read[labels] = len(found) - len(rows)
@@ -482,8 +481,7 @@ def fit(photograph: Annotated, size: tuple[int, int], how: str) -> Fitted:
     shown = (upright * scale).round().clip(1).astype(int)
     shift = (available - shown) // 2
     canvas = Image.new("RGB", tuple(available.tolist()), (BORDER,) * 3)
-    reduced = image.resize(tuple(shown.tolist()), Image.Resampling.LANCZOS)
-    canvas.paste(reduced, tuple(shift.tolist()))
+    canvas.paste(image.resize((*shown,), Image.Resampling.LANCZOS), (*shift,))
     pixels = np.array(canvas).transpose(2, 0, 1)
     return Fitted(pixels, boxes[is_kept], is_kept, shown / upright, shift.astype(float), upright)
 

@@ -227,8 +227,7 @@ def _collate(items: Sequence[tuple[Tensor, ReadErrors]]) -> tuple[Tensor, ReadEr
     errors = {path: error for _, of_image in items for path, error in of_image.items()}
     images = [image for image, _ in items]
     # An array without images broadcasts to any size.
-    nothing = torch.empty(0, 3, 1, 1, dtype=torch.uint8)
-    return torch.stack(images) if images else nothing, errors
+    return torch.stack(images) if images else torch.empty(0, 3, 1, 1, dtype=torch.uint8), errors
 
 
 @dataclass(frozen=True)

@@ -84,3 +84,9 @@ def test_relighting_needs_photographs_alone_and_no_settings_that_it_does_not_use
         settings_of(*words, word)
     assert caught.value.argument == key
     assert "relighting" in str(caught.value)
+
+
+def test_no_results_are_written_among_the_photographs(half_dark):
+    words = "attack=relighting", f"unlabeled={half_dark}", f"out={half_dark / 'out'}"
+    with pytest.raises(InputError, match="lies inside"):
+        run(settings_of(*words))

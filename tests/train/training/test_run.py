@@ -315,6 +315,18 @@ def test_a_run_warns_if_it_would_score_images_that_it_trains_on(
     assert ("which is trained on" in caplog.text) == is_warned
 
 
+@pytest.mark.parametrize("source", ["data.path={}", "unlabeled={}"])
+def test_no_run_lies_among_the_images_that_it_trains_on(tiny, finished, tmp_path, source):
+    rng = np.random.default_rng(0)
+    for name, number in itertools.product(("apple", "orange"), range(3)):
+        save_noise(tmp_path / name / f"{number}.png", rng, (16, 16))
+    options = source.format(tmp_path), f"network={finished}", "data.test_fraction=0.3", "size=16"
+    recipe = f"data={'folder' if 'data' in source else 'unlabeled'}", "train.distillation_weight=1"
+    settings = tiny(*recipe, *options, *WITHOUT_RENDERS)
+    with pytest.raises(InputError, match="lies inside"):
+        loaded_run(settings, tmp_path / "run")
+
+
 def test_a_damaged_file_is_replaced_by_a_trained_or_a_held_out_one_as_it_is_itself(
     tiny, finished, tmp_path, monkeypatch
 ):
