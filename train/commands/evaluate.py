@@ -48,8 +48,8 @@ def run(settings: EvaluateSettings) -> None:
         network = with_task(loaded.normalizing_light(settings.normalize_light), settings)
         photos = published_folder(Path(settings.photos))
         # The run is scored on the positive classes of its training, if the folder has classes.
-        names = folder_names(photos) if label is None and photos.is_dir() else ()
-        if {*names}.intersection(map(composed, network.classes)):
+        folders = folder_names(photos) if label is None and photos.is_dir() else ()
+        if {*folders}.intersection(map(composed, network.classes)):
             label = trained_labels(Path(settings.run)) or None
     with keyed("label"):
         for name in [] if label is None else label_names(label):

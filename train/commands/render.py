@@ -18,6 +18,7 @@ from train.class_names import name_of_mesh
 from train.command_settings import RenderSettings
 from train.data.annotations import DATA_SET
 from train.data.formats import FORMATS
+from train.data.photographs import require_outside
 from train.device import choose_device, choose_rasterizer
 from train.run_config import fingerprints, require_same_inputs
 from train.run_folder import read_json, writable_folder, write_json
@@ -48,6 +49,9 @@ def run(settings: RenderSettings) -> None:
         console.warning("unlabeled objects are drawn, but not annotated: %s", ", ".join(unlabeled))
     classes = [*dict.fromkeys(label for label in labels if label)]
     folder = writable_folder(settings.out, "out")
+    vary = settings.augment.vary
+    for taken in filter(None, (vary.backgrounds, vary.camera.slides)):
+        require_outside(folder, Path(taken))
     for name in classes if settings.format == "imagefolder" else ():
         # A name such as "a/b" or ".." would be another folder.
         if (folder / name).resolve().parent != folder.resolve():

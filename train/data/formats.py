@@ -131,10 +131,8 @@ class Coco(DataSet):
 
     def finish(self) -> None:
         """Write annotations/instances_PART.json for each part."""
-        categories = [
-            {"id": number, "name": name, "supercategory": name}
-            for number, name in enumerate(self.classes, 1)
-        ]
+        numbered = enumerate(self.classes, 1)
+        categories = [{"id": key, "name": name, "supercategory": name} for key, name in numbered]
         numbers = itertools.count(1)
         for part in self.splits:
             images, annotations = [], []

@@ -283,10 +283,7 @@ def _score(
     groups = {ALL: [*names], **{name: [label] for label, name in names.items()}}
     # A score of 32 bits reaches the threshold that rounds to it.
     threshold = min(task.threshold, float(np.float32(task.threshold)))
-    return {
-        name: detections.score(at_iou, chosen, threshold, at_half)
-        for name, chosen in groups.items()
-    }
+    return {name: detections.score(at_iou, of, threshold, at_half) for name, of in groups.items()}
 
 
 def evaluate_segmenter(network: TaskNetwork, folder: Path, how: Showing) -> SegmentationScores:

@@ -81,8 +81,9 @@ class Run:
         trained = Path(data.path if self.data.labeled else str(settings.unlabeled)).resolve()
         if data.name == "folder" and (trained / "train").is_dir():
             trained /= "train"  # The images beside it, in "test", are not trained on.
-        if is_folder:
-            photographs.require_outside(folder, trained)
+        vary = settings.augment.vary
+        for taken in filter(None, (is_folder and trained, vary.backgrounds, vary.camera.slides)):
+            photographs.require_outside(folder, Path(str(taken)))
         for name, scored in self.scored_folders.items():
             real = scored.resolve()
             if is_folder and (real.is_relative_to(trained) or trained.is_relative_to(real)):

@@ -268,6 +268,15 @@ def test_processes_that_begin_at_once_do_not_refuse_the_folder(meshes, tmp_path,
     assert len(pictures(write(meshes[:1], out, count=1, maps=[]))) == 1
 
 
+@pytest.mark.parametrize("key", ["backgrounds", "slides"])
+def test_renders_are_not_written_among_the_images_that_they_show(meshes, tmp_path, key):
+    augment = nb.AugmentationSettings(mode="random")
+    owner = augment.vary if key == "backgrounds" else augment.vary.camera
+    setattr(owner, key, str(tmp_path))
+    with pytest.raises(InputError, match="lies inside"):
+        write(meshes, tmp_path / "renders", augment=augment)
+
+
 def test_a_folder_of_other_files_is_refused(meshes, tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(InputError, match="not empty"):

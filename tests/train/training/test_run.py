@@ -315,14 +315,17 @@ def test_a_run_warns_if_it_would_score_images_that_it_trains_on(
     assert ("which is trained on" in caplog.text) == is_warned
 
 
-@pytest.mark.parametrize("source", ["data.path={}", "unlabeled={}"])
+@pytest.mark.parametrize(
+    "source", ["data.path={}", "unlabeled={}", "unlabeled={0}/apple,augment.vary.backgrounds={0}"]
+)
 def test_no_run_lies_among_the_images_that_it_trains_on(tiny, finished, tmp_path, source):
     rng = np.random.default_rng(0)
     for name, number in itertools.product(("apple", "orange"), range(3)):
         save_noise(tmp_path / name / f"{number}.png", rng, (16, 16))
-    options = source.format(tmp_path), f"network={finished}", "data.test_fraction=0.3", "size=16"
-    recipe = f"data={'folder' if 'data' in source else 'unlabeled'}", "train.distillation_weight=1"
-    settings = tiny(*recipe, *options, *WITHOUT_RENDERS)
+    options = *source.format(tmp_path).split(","), f"network={finished}", "data.test_fraction=0.4"
+    recipe = "size=16", "train.distillation_weight=1", *WITHOUT_RENDERS
+    name = "folder" if source.startswith("data") else "unlabeled"
+    settings = tiny(f"data={name}", *options, *recipe)
     with pytest.raises(InputError, match="lies inside"):
         loaded_run(settings, tmp_path / "run")
 
