@@ -280,10 +280,8 @@ def _score(
     names: dict[int, str] = {}
     for name, own in labels.items():
         names.setdefault(own, name)
-    groups = {ALL: [*names], **{name: [label] for label, name in names.items()}}
-    # A score of 32 bits reaches the threshold that rounds to it.
-    threshold = min(task.threshold, float(np.float32(task.threshold)))
-    return {name: detections.score(at_iou, of, threshold, at_half) for name, of in groups.items()}
+    kinds = {ALL: [*names], **{name: [label] for label, name in names.items()}}
+    return {key: detections.score(at_iou, of, task.threshold, at_half) for key, of in kinds.items()}
 
 
 def evaluate_segmenter(network: TaskNetwork, folder: Path, how: Showing) -> SegmentationScores:

@@ -196,6 +196,8 @@ def score(
     `at_half` are the matches of the same detections at an IoU of 0.5, if others are at another.
     The intervals can be over units that have several images: `units` has that of each image.
     """
+    # A score of 32 bits reaches the threshold that rounds to it.
+    threshold = min(threshold, float(np.float32(threshold)))
     joined = matches.of(labels)
     by_label = [(at_half or matches).of([label]) for label in labels]
     # Classes without objects have no average precision.

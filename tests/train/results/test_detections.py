@@ -105,6 +105,14 @@ def test_an_object_has_at_most_one_detection_of_its_class(boxes, labels, scores,
     assert detections.match(_found(boxes, labels, scores), marked, 0.5).tolist() == expected
 
 
+@pytest.mark.parametrize("threshold", [0.1, 0.3, 0.7, 0.9])
+def test_a_score_of_32_bits_at_the_threshold_counts_as_right_and_as_false(threshold):
+    scores = np.float32([threshold, threshold])
+    found = _found([BOX, BOX + 50], [0, 0], scores)
+    metrics = detections.score(_match([found], [_marked(BOX, [0])]), [0], threshold)
+    assert (metrics.recall.value, metrics.false_per_image.value) == (1, 1)
+
+
 def test_ap50_is_at_an_iou_of_one_half_whatever_that_of_the_recall():
     # The IoU is 20 · 20 / (20 · 33), which is 0.606.
     found, marked = _found([[10, 10, 30, 43]], [0], [0.9]), _marked(BOX, [0])
