@@ -23,6 +23,7 @@ from jaxtyping import Float, Int32, UInt8
 from PIL import Image
 from torch import Tensor
 from torch.utils._pytree import SequenceKey, tree_flatten_with_path, tree_unflatten
+from torch.utils.data import get_worker_info
 from torchvision import tv_tensors
 from torchvision.transforms import v2
 
@@ -550,8 +551,12 @@ def _albumentations_class() -> Any:
             self.lighting = RandomLighting(lights, strength=strength)
 
         def get_params(self) -> dict[str, Any]:
-            """Draw a light with a seed of Albumentations."""
-            with seeded(self.py_random.getrandbits(62)):
+            """Draw a light with a seed of Albumentations and of a worker of a data loader.
+
+            Albumentations has the same numbers in all workers, and again in each epoch.
+            """
+            seed, worker = self.py_random.getrandbits(62), get_worker_info()
+            with seeded(seed ^ worker.seed if worker else seed):
                 return self.lighting.make_params()
 
         def apply(self, img: np.ndarray, lights: Sequence[Light | None], **_: Any) -> np.ndarray:

@@ -472,6 +472,30 @@ def test_albumentations_keeps_lights_in_dictionaries_and_random_numbers_in_pickl
         assert np.array_equal(compose(image=array)["image"], copy(image=array)["image"])
 
 
+@pytest.mark.ecosystem
+def test_albumentations_draws_other_lights_in_each_worker_and_epoch():
+    albumentations = pytest.importorskip("albumentations")
+    light = albumentations.Compose([nb.RandomLighting("linear").albumentations()], seed=5)
+
+    class Relit(torch.utils.data.Dataset):
+        def __len__(self) -> int:
+            return 4
+
+        def __getitem__(self, index: int) -> np.ndarray:
+            return light(image=np.full((4, 6, 3), 128, np.uint8))["image"]
+
+    options = {"num_workers": 2, "multiprocessing_context": "fork"}
+    loader = torch.utils.data.DataLoader(Relit(), 2, **options)
+
+    def draw() -> list[bytes]:
+        torch.manual_seed(0)
+        return [image.numpy().tobytes() for _ in range(2) for batch in loader for image in batch]
+
+    first = draw()
+    assert len({*first}) == len(first) == 8
+    assert draw() == first
+
+
 def test_normalized_images_are_refused_and_floats_of_bytes_give_a_warning():
     images = picture(2, 3, 8, 8)
     with pytest.raises(nb.InputError, match="before Normalize"):
