@@ -23,11 +23,10 @@ from jaxtyping import Float, Int32, UInt8
 from PIL import Image
 from torch import Tensor
 from torch.utils._pytree import SequenceKey, tree_flatten_with_path, tree_unflatten
-from torch.utils.data import get_worker_info
 from torchvision import tv_tensors
 from torchvision.transforms import v2
 
-from augment.random_streams import generator, seeded, stream_seed, usual_defaults
+from augment.random_streams import generator, usual_defaults
 from augment.scene import loops
 from augment.scene.lights import MODELS, Drawn, Illumination, LightModel, LowLight, normal_noise
 from augment.scene.loops import BIN_BITS, BINS
@@ -136,11 +135,14 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
         """Return the settings as text."""
         return f"{self.lights}, p={self.p}, strength={self.strength}"
 
-    def make_params(self, flat_inputs: Sequence[Any] = ()) -> dict[str, Any]:
+    def make_params(
+        self, flat_inputs: Sequence[Any] = (), draws: torch.Generator | None = None
+    ) -> dict[str, Any]:
         """Draw a light for each image of a batch, or one light.
 
         Args:
             flat_inputs: Images. Their largest batch gets as many lights.
+            draws: Generator of random numbers on the CPU. None for torch's global one.
 
         Returns:
             Lights, which `apply` takes.
@@ -150,11 +152,12 @@ class RandomLighting(v2.Transform):  # type: ignore[misc, unused-ignore]
         models, weights = [*self.lights], [*self.lights.values()]
         lights: list[Light | None] = []
         with usual_defaults():
-            seeds = torch.randint(2**62, (count,)).tolist()
-            for seed, (chance, choice) in zip(seeds, torch.rand(count, 2).tolist(), strict=True):
+            seeds = torch.randint(2**62, (count,), generator=draws).tolist()
+            chances = torch.rand(count, 2, generator=draws).tolist()
+            for seed, (chance, choice) in zip(seeds, chances, strict=True):
                 # Draw a model with a probability in proportion to its weight.
                 model = models[bisect(list(accumulate(weights)), choice * sum(weights))]
-                values = torch.rand(model.dimensions + model.constants)
+                values = torch.rand(model.dimensions + model.constants, generator=draws)
                 is_changed = chance < self.p and self.strength > 0
                 lights.append(Light(model, values, seed, self.strength) if is_changed else None)
         return {"lights": lights}
@@ -300,8 +303,9 @@ def relight_photographs(
             raise InputError(f"slides are not used with lights: {advice}", "slides")
         if isinstance(photographs, np.ndarray):
             photographs = torch.from_numpy(np.require(photographs, requirements=["C", "W"]))
-        with seeded(stream_seed(seed, "lights")):
-            return RandomLighting(lights, strength=strength)(photographs)
+        # The seed of a global generator would not hold while other threads draw from it.
+        lamps = RandomLighting(lights, strength=strength)
+        return lamps.apply(photographs, lamps.make_params([photographs], generator(seed, "lights")))
     if strength != 1.0:
         raise InputError("strength is not used without lights: give lights", "strength")
     photographs = as_photographs("photographs", photographs)
@@ -353,10 +357,8 @@ def _apply_to_pil(image: Image.Image, lights: Sequence[Light | None], depth: Any
     elif image.mode in CONVERTED:
         mode = "RGBA" if "transparency" in image.info else CONVERTED[image.mode]
         made = _apply_to_pil(image.convert(mode), lights, depth)
-        if image.mode == "P":
-            made = made.quantize(method=Image.Quantize.FASTOCTREE)
-        else:
-            made = made.convert(image.mode)
+        octree = Image.Quantize.FASTOCTREE
+        made = made.quantize(method=octree) if image.mode == "P" else made.convert(image.mode)
     else:
         raise InputError(f"the image has the mode {image.mode}: convert it to RGB")
     made.info.update({key: value for key, value in image.info.items() if key != "transparency"})
@@ -555,9 +557,9 @@ def _albumentations_class() -> Any:
 
             Albumentations has the same numbers in all workers, and again in each epoch.
             """
-            seed, worker = self.py_random.getrandbits(62), get_worker_info()
-            with seeded(seed ^ worker.seed if worker else seed):
-                return self.lighting.make_params()
+            worker = torch.utils.data.get_worker_info()
+            seed = self.py_random.getrandbits(62) ^ (worker.seed if worker else 0)
+            return self.lighting.make_params((), torch.Generator().manual_seed(seed))
 
         def apply(self, img: np.ndarray, lights: Sequence[Light | None], **_: Any) -> np.ndarray:
             """Relight an array."""

@@ -2,6 +2,7 @@ import json
 import math
 import pickle
 from collections import UserDict
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -494,6 +495,20 @@ def test_albumentations_draws_other_lights_in_each_worker_and_epoch():
     first = draw()
     assert len({*first}) == len(first) == 8
     assert draw() == first
+
+
+def test_the_seed_of_a_function_holds_while_other_threads_draw_random_numbers():
+    images = picture(3, 8, 8)
+
+    def relight(seed: int) -> torch.Tensor:
+        return nb.relight_photographs(images, seed, lights=["linear", "lamps"])
+
+    alone = [relight(seed) for seed in range(4)]
+    state = torch.get_rng_state()
+    with ThreadPoolExecutor(8) as pool:
+        together = [*pool.map(relight, [*range(4)] * 25)]
+    assert all(torch.equal(each, alone[row % 4]) for row, each in enumerate(together))
+    assert torch.equal(torch.get_rng_state(), state)
 
 
 def test_normalized_images_are_refused_and_floats_of_bytes_give_a_warning():
