@@ -539,7 +539,8 @@ def as_network(
 
 def require_evaluation_mode(network: object, argument: str) -> None:
     """Check that no module of a network is in training mode."""
-    if not isinstance(network, nn.Module) or not any(part.training for part in network.modules()):
+    modules = network.modules() if isinstance(network, nn.Module) else ()
+    if not any(getattr(part, "training", False) for part in modules):
         return
     # A module of torch.export has its own attribute `eval`, which raises an error.
     if "eval" in vars(network):

@@ -102,7 +102,7 @@ class Network(nn.Module):
         self.network: Any = network if isinstance(network, nn.Module) else Function(network)
         # `train` of a network of torch.export raises an error.
         for part in (self, self.transforms, *self.transforms):
-            part.training = self.network.training
+            part.training = getattr(self.network, "training", False)
 
     def forward(self, images: Tensor, *targets: Any) -> Any:
         """Compute the outputs of RGB images (N, 3, H, W) in [0, 1].
@@ -237,7 +237,7 @@ class Function(nn.Module):
             # Transformations of images are modules in training mode, too, but have no weights.
             has_weights = next(module.parameters(recurse=False), None) is not None
             kinds = nn.modules.dropout._DropoutNd | nn.modules.batchnorm._NormBase
-            if module.training and (has_weights or isinstance(module, kinds)):
+            if getattr(module, "training", False) and (has_weights or isinstance(module, kinds)):
                 in_training.append(type(module).__name__)
 
         with register_module_forward_pre_hook(note):
@@ -425,7 +425,8 @@ def eval_mode(network: Any) -> Iterator[None]:
     A function is left as it is.
     """
     modules = [*network.modules()] if isinstance(network, nn.Module) else []
-    flags = [module.training for module in modules]
+    # A frozen module of TorchScript has no mode.
+    flags = [getattr(module, "training", False) for module in modules]
     try:
         # `eval` of a large network takes as long as rendering an image, so call it only if needed.
         if any(flags):
@@ -452,9 +453,8 @@ def frozen_eval_mode(network: nn.Module) -> Iterator[None]:
     the global random generators are restored after the block.
     """
     # Networks may draw random numbers on the GPUs on which they lie.
-    gpus = {parameter.device for parameter in network.parameters() if parameter.is_cuda}
-    random_state = torch.random.fork_rng(devices=sorted(gpus, key=str))
-    with gradient_flags_kept(network), eval_mode(network), random_state:
+    gpus = {weight.device for weight in network.parameters() if weight.is_cuda}
+    with gradient_flags_kept(network), eval_mode(network), torch.random.fork_rng([*gpus]):
         # Modules of TorchScript lack `requires_grad_`.
         for parameter in network.parameters():
             parameter.requires_grad_(False)

@@ -442,3 +442,15 @@ def test_timm_tells_the_size_of_a_network_in_memory_which_is_assumed(said, warne
     assert as_network(timm.create_model("test_efficientnet", num_classes=3).eval()).size == 160
     assert "160 × 160 pixels, assumed" in said()[0]
     assert warned() == ["size=160"]
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit")
+def test_a_frozen_network_of_torchscript_has_the_same_logits():
+    network = nn.Sequential(nn.Conv2d(3, 4, 3), nn.BatchNorm2d(4), nn.Flatten(), nn.Linear(144, 3))
+    frozen = torch.jit.freeze(torch.jit.script(network.eval()))
+    images = torch.rand(2, 3, 8, 8)
+    for given in (frozen, lambda shown: frozen(shown)):
+        classifier = nb.Classifier(given, 8, ["red", "green", "blue"])
+        torch.testing.assert_close(classifier(images), network(images))
+    relit = nb.AdversarialLighting(frozen, lights="linear")(images)
+    assert relit.shape == images.shape and not torch.equal(relit, images)
