@@ -226,7 +226,8 @@ class AdversarialLighting:
         if gradient is not None:
             # The light is differentiable in its first numbers only. The others stay.
             smooth = slice(light.model.dimensions)
-            values[smooth].sub_(STEP / self.steps * gradient[smooth].sign()).clamp_(0, 1)
+            moved = values[smooth] - STEP / self.steps * gradient[smooth].sign()
+            values[smooth] = moved.clamp(0, 1)
         return light._replace(values=values)
 
 
